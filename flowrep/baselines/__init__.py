@@ -1,4 +1,4 @@
-"""Baselines to compare an agent with: a privileged planner, never turning, random actions."""
+"""Baselines to compare an agent with: privileged planners, never turning, random actions."""
 
 from collections.abc import Callable
 
@@ -38,6 +38,8 @@ class RandomActions:
 
 BASELINES: dict[str, Callable[[], Baseline]] = {
     "planner": Planner,
+    # wide margins first, as people are not where it expects them
+    "speed_blind": lambda: Planner((100,), (1.0, 0.5, 0.1), sees_speed=False),
     "never_turn": lambda: never_turn,
     "random": RandomActions,
 }

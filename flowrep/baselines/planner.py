@@ -1,13 +1,15 @@
 """A privileged baseline that knows every pose, present and future, and searches ahead.
 
 It is no agent but an upper bound for a scene: a beam search that simulates the rest of the episode
-up to the ending zone and keeps only drives without a collision.
+up to the ending zone and keeps only drives without a collision. Blind to speed, it is a reference:
+an agent that does better at speeds far from the normal ones must read people's speed.
 """
 
 import heapq
 import math
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -18,13 +20,14 @@ from flowrep.envs.episode import Episode
 from flowrep.envs.street_env import StreetEnv
 from flowrep.scenes.layout import Layout, free_ground
 from flowrep.scenes.pedestrians import RADIUS_M as PERSON_RADIUS_M
+from flowrep.scenes.pedestrians import Crowd
 from flowrep.scenes.scene import Path
 from flowrep.scenes.vehicle import NO_OP, YAW_SIGN, VehicleState, footprint_corners, roll, turn
 
 Array = NDArray[Any]
 _ACTIONS = np.array([0, 1, 2])
 _HOLD_STEPS = 2  # steps that each decision of the search holds for
-_MARGIN_M = 0.1  # distance kept from people and from the road's edge
+_MARGIN_M = 0.1  # distance kept from the road's edge, and from people whose speed is known
 # States in the same cell are interchangeable: x, y in metres, yaw and yaw rate in degrees. Only the
 # best of a cell is kept, so that a beam holds different drives and not variants of one.
 _CELL = np.array([0.5, 0.5, 4.0, 6.0])
@@ -44,10 +47,20 @@ class Planner:
     Args:
         beams: beam widths; a wider beam is tried if no drive of a narrower one reaches the ending
             zone.
+        margins_m: distances to keep from people, in the order in which they are tried.
+        sees_speed: whether it knows how fast people walk. If not, it sees where everyone is and
+            heads to, takes all who walk for the mean of the scene's normal speeds, and plans again
+            after each decision.
     """
 
-    def __init__(self, beams: Sequence[int] = (100, 600)) -> None:
-        self.beams = tuple(beams)
+    def __init__(
+        self,
+        beams: Sequence[int] = (100, 600),
+        margins_m: Sequence[float] = (_MARGIN_M,),
+        *,
+        sees_speed: bool = True,
+    ) -> None:
+        self.beams, self.margins_m, self.sees_speed = tuple(beams), tuple(margins_m), sees_speed
         self._plan: dict[int, int] = {}  # actions by step
         self._expected: Any = None  # episode, steps and yaw rate if the action is taken
 
@@ -56,7 +69,9 @@ class Planner:
         episode = env.episode
         state, steps = episode.now.vehicle, episode.steps
         if self._expected != (episode, steps, state.yaw_rate_rps) or steps not in self._plan:
-            self._plan = dict(enumerate(self.search(episode), start=steps))
+            actions = self.search(episode)
+            actions = actions if self.sees_speed else actions[:_HOLD_STEPS]
+            self._plan = dict(enumerate(actions, start=steps))
         action = self._plan.get(steps, NO_OP)
         turned = turn(state, YAW_SIGN[action], episode.dt_s, episode.layout.scene.vehicle)
         self._expected = (episode, steps + 1, turned.yaw_rate_rps)
@@ -64,9 +79,13 @@ class Planner:
 
     def search(self, episode: Episode) -> list[int]:
         """Returns the actions of a drive to the ending zone, or of the longest drive found."""
-        search, longest = _Search(episode), list[int]()
-        for beam in self.beams:
-            actions, is_complete = search.run(beam)
+        crowd = episode.crowd
+        if not self.sees_speed:
+            normal = sum(episode.layout.scene.pedestrian_speed_mps["normal"]) / 2
+            crowd = crowd.all_walking_at(normal, episode.now.ticks * episode.tick_s)
+        search, longest = _Search(episode, crowd), list[int]()
+        for margin_m, beam in product(self.margins_m, self.beams):
+            actions, is_complete = search.run(beam, margin_m)
             if is_complete:
                 return actions
             longest = max(longest, actions, key=len)
@@ -116,11 +135,12 @@ def _ground(layout: Layout, path: Path) -> tuple[shapely.Geometry, GoalDistance]
 class _Search:
     """Simulates one episode for V vehicles at once; states hold arrays [V]."""
 
-    def __init__(self, episode: Episode) -> None:
-        self.episode, self.vehicle = episode, episode.layout.scene.vehicle
+    def __init__(self, episode: Episode, crowd: Crowd) -> None:
+        self.episode, self.crowd = episode, crowd
+        self.vehicle = episode.layout.scene.vehicle
         self.free, self.way = _ground(episode.layout, episode.path)
 
-    def run(self, beam: int) -> tuple[list[int], bool]:
+    def run(self, beam: int, margin_m: float) -> tuple[list[int], bool]:
         """Returns the actions of the best drive found, and whether it arrives."""
         episode = self.episode
         state = VehicleState(*(np.array([value]) for value in episode.now.vehicle))
@@ -130,7 +150,7 @@ class _Search:
             parents = np.repeat(np.arange(state.x_m.size), len(_ACTIONS))
             actions = np.tile(_ACTIONS, state.x_m.size)
             state = VehicleState(*(value[parents] for value in state))
-            state, alive, arrived = self.drive(state, actions, ticks)
+            state, alive, arrived = self.drive(state, actions, ticks, margin_m)
             steps, ticks = steps + _HOLD_STEPS, ticks + _HOLD_STEPS * episode.ticks_per_step
             kept = np.flatnonzero(arrived)[:1] if arrived.any() else self.best(state, alive, beam)
             if not kept.size:
@@ -142,7 +162,7 @@ class _Search:
         return np.repeat(history[0], _HOLD_STEPS).tolist(), False
 
     def drive(
-        self, state: VehicleState, actions: Array, ticks: int
+        self, state: VehicleState, actions: Array, ticks: int, margin_m: float
     ) -> tuple[VehicleState, Array, Array]:
         """Returns the states after one decision, which of them are unharmed and which arrived."""
         alive, arrived = np.ones(actions.size, dtype=bool), np.zeros(actions.size, dtype=bool)
@@ -152,7 +172,7 @@ class _Search:
             for _ in range(self.episode.ticks_per_step):
                 state = roll(state, self.episode.tick_s, self.episode.vehicle_speed_mps)
                 ticks += 1
-                alive &= arrived | ~self._touches(state, ticks)
+                alive &= arrived | ~self._touches(state, ticks, margin_m)
                 corners = footprint_corners(state, self.vehicle, _MARGIN_M)
                 inside = shapely.contains_xy(self.free, corners[..., 0], corners[..., 1])
                 alive &= arrived | inside.all(axis=-1)
@@ -172,8 +192,8 @@ class _Search:
         _, first = np.unique(cells, axis=0, return_index=True)
         return index[order[np.sort(first)[:most]]]
 
-    def _touches(self, state: VehicleState, ticks: int) -> Array:
-        people = self.episode.crowd.positions(ticks * self.episode.tick_s)
+    def _touches(self, state: VehicleState, ticks: int, margin_m: float) -> Array:
+        people = self.crowd.positions(ticks * self.episode.tick_s)
         # Only people within reach of the box around all vehicles of the beam.
         reach = self.vehicle.length_m + self.vehicle.width_m
         low = np.array([state.x_m.min(), state.y_m.min()]) - reach
@@ -186,4 +206,4 @@ class _Search:
         ahead = np.abs(cosine * dx + sine * dy) - self.vehicle.length_m / 2
         aside = np.abs(cosine * dy - sine * dx) - self.vehicle.width_m / 2
         gap = np.hypot(np.maximum(ahead, 0.0), np.maximum(aside, 0.0))
-        return (gap < PERSON_RADIUS_M + _MARGIN_M).any(axis=-1)
+        return (gap < PERSON_RADIUS_M + margin_m).any(axis=-1)

@@ -45,7 +45,7 @@ CountOrZero = Annotated[int, Field(ge=0, le=2**53)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]  # larger ones are more than numpy takes
 SpeedMode = Literal["low", "normal", "high"]
 FrameRate = Annotated[float, Field(ge=0.5, le=1000)]
-BaselineName = Literal["planner", "never_turn", "random"]
+BaselineName = Literal["planner", "speed_blind", "never_turn", "random"]
 Renderer = Literal["auto", "rasteriser", "pybullet"]
 MotionSource = Literal["exact", "estimated"]
 Device = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]

@@ -39,7 +39,12 @@ _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "p")
 _TEXT, _FAINT = "#1b1f24", "#6b7480"
 
 _TITLES = dict(zip(SCENES, ("Straight Road", "S-Turn", "H-Shaped Pathways", "Three-Way Junction")))
-_BASELINE_LINES: dict[str, Any] = {"never_turn": ":", "random": "-.", "planner": "--"}
+_BASELINE_LINES: dict[str, Any] = {
+    "never_turn": ":",
+    "random": "-.",
+    "planner": "--",
+    "speed_blind": (0, (6, 2, 1, 2)),
+}
 _COLUMN_IN, _PAGE_IN = 3.5, 7.16  # widths of a paper's column and page (IEEE's two columns)
 _MOST_IN_A_ROW = 4  # panels
 _WIDEST_BAR = 0.3  # as a share of a group

@@ -26,7 +26,7 @@ COMPLEMENTARY_STACKS = (
     "seg2", "depth2", "ego+obj", "ego+obj+seg2", "ego+obj+depth2", "ego+obj+seg2+depth2",
 )  # fmt: skip
 STACKS = tuple(dict.fromkeys(FLOW_STACKS + COMPLEMENTARY_STACKS))
-BASELINES = ("never_turn", "random", "planner")
+BASELINES = ("never_turn", "random", "planner", "speed_blind")
 _REPRESENTATIONS = ("raw", "ego", "obj", "seg", "seg2", "depth", "depth2", "rgb")
 _OF_EVERY_SCENE = ("camera", "frame_rate_hz")  # keys of a scene that scenes share
 

@@ -157,6 +157,12 @@ class Crowd:
         poses[..., 3] = _SWING_RAD * np.where(self._speeds > 0, np.sin(step), 1.0)
         return poses
 
+    def all_walking_at(self, speed_mps: float, time_s: float) -> "Crowd":
+        """Returns a crowd with these positions at a time, in which all who walk have one speed."""
+        speeds = np.where(self._speeds > 0, speed_mps, 0.0)
+        phases = (self._along(time_s) - speeds * time_s) / self._there_and_back % 1.0
+        return Crowd(list(self._points), speeds, phases)
+
     def _along(self, time_s: float | Array) -> Array:
         # Metres walked since the near end, in [0, length of the round trip).
         return (self._start + self._speeds * time_s) % self._there_and_back

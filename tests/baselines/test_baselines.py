@@ -1,5 +1,7 @@
 """Is Straight Road a fair task? A small count here; `examples/scene_validity.py` has the rest."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 import shapely
@@ -30,6 +32,17 @@ def test_the_planner_plans_anew_where_it_is_led_astray(make_street, empty_road):
     while not env.episode.outcome:
         env.step(planner(env))
     assert env.episode.outcome.label == "success"
+
+
+def test_a_planner_blind_to_speed_plans_the_same_whatever_the_speed(make_street):
+    plans = {True: [], False: []}
+    for sees_speed, speed_mps in product(plans, ((0.5, 0.5), (2.5, 2.5))):
+        env = make_street(speed=speed_mps, sensors=())
+        env.reset(seed=0)  # the same people at the same places
+        planner = Planner((100,), sees_speed=sees_speed)
+        plans[sees_speed].append(planner.search(env.episode))
+    assert plans[False][0] == plans[False][1]
+    assert plans[True][0] != plans[True][1]
 
 
 def test_the_way_to_go_leads_round_corners():

@@ -52,6 +52,14 @@ def test_everyone_is_where_the_timetable_says(crowd, time_s, expected):
     np.testing.assert_allclose(crowd.poses(time_s)[:, :2], expected, atol=1e-12)
 
 
+def test_a_crowd_of_one_speed_is_where_everyone_was_and_walks_on_the_same_way(crowd):
+    # At 4 s, A is 4 m out and B, 1 m past its turn, on its way back. At 0.5 m/s for 2 s more each
+    # is a metre further; at their true speeds A would be at 6 m and B round its corner.
+    slower = crowd.all_walking_at(0.5, 4.0)
+    np.testing.assert_allclose(slower.positions(4.0), crowd.positions(4.0), atol=1e-9)
+    np.testing.assert_allclose(slower.positions(6.0), [(5, 0), (2, 5), (0, 3)], atol=1e-9)
+
+
 def test_people_look_where_they_walk_and_turn_about_at_the_ends(crowd):
     def looks(time_s, person):
         return crowd.poses(time_s)[person, 2] % (2 * math.pi)
