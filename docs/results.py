@@ -1,18 +1,15 @@
 """The page of results: `make results` writes docs/results.md and its figure.
 
-claims.yaml declares what is tested, results.md.jinja has the words around the numbers, and all
-numbers come from the packed runs. `flowrep.report.statistics` decides whether a claim holds. A run
-counts with its success rate over the episodes that all compared runs drove.
+claims.py tests what claims.yaml declares, results.md.jinja has the words around the numbers, and
+all numbers come from the packed runs.
 """
 
 import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from fnmatch import fnmatch
-from itertools import chain, count
+from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import yaml
@@ -20,7 +17,21 @@ from jinja2 import FileSystemLoader
 from matplotlib.figure import Figure
 from scipy import stats
 
-from flowrep.report.figures import encoded, styled, words
+from docs.claims import (
+    SHORT,
+    Cell,
+    Claim,
+    Contrast,
+    HeldOut,
+    Studies,
+    claims_of,
+    conditions_of,
+    contrast_of,
+    measure_of,
+    scores,
+    studies_of,
+)
+from flowrep.report.figures import draw_bars, encoded, styled, words
 from flowrep.report.page import TEMPLATES
 from flowrep.report.runs import (
     SCENES,
@@ -28,24 +39,24 @@ from flowrep.report.runs import (
     STACKS,
     Condition,
     Run,
+    SuccessGrid,
     baseline_share,
     cell_of,
     departures,
+    grid_of,
     in_order,
     in_stacks,
     own_scores,
-    paired_scores,
     success_rate,
 )
-from flowrep.report.statistics import LEVEL, UNSEEN, Array, Effect, effect, holm, mean_share
+from flowrep.report.statistics import LEVEL, Array, Effect, mean_share
 from flowrep.report.storage import read_archive
 from flowrep.report.tables import Table, p_text, percent, points, signed
 
 HERE = Path(__file__).parent
 DATA, PAGE = HERE.parent / "outputs" / "reference", HERE / "results.md"
-FIGURE = "images/results_claims.svg"
+FIGURE, HELD_OUT_FIGURE = "images/results_claims.svg", "images/results_held_out.svg"
 CLAIMS = HERE / "claims.yaml"
-_SHORT = dict(zip(SCENES, ("SR", "ST", "H", "T")))
 _COLOURS = dict(zip(SCENES, ("#0072b2", "#e69f00", "#009e73", "#cc79a7")))
 _STUDY = {"resolution": ", 84 px", "wide_confirmation": ", 0.6–2.4 m/s"}  # in the figure
 _TIED = "\u00a0"  # a space at which no line breaks
@@ -53,141 +64,6 @@ _WIDEST = 80  # points, where the figure's axis ends
 _POWER = 0.8
 _FOUND = 0.5  # a run finds a way if it succeeds in this share of its episodes
 _HARDLY_EVER = 0.05  # success at the training speed
-
-Studies = Mapping[str, Mapping[str, Sequence[Run]]]
-
-
-def studies_of(declared: Mapping[str, Any], runs: Sequence[Run]) -> Studies:
-    """Returns the finished runs of each study and scene, if there are any."""
-
-    def finished(patterns: str) -> list[Run]:
-        asked = [r for r in runs if any(fnmatch(r.name, p) for p in patterns.split())]
-        return [run for run in asked if run.is_finished]
-
-    return {
-        study: {s: of for s, patterns in of_scenes.items() if (of := finished(patterns))}
-        for study, of_scenes in declared["studies"].items()
-    }
-
-
-@dataclass
-class Contrast:
-    """One comparison that claims.yaml asks for, and its outcome.
-
-    p values are corrected if the claim is primary.
-    """
-
-    asked: Mapping[str, Any]
-    effect: Effect | None  # in the mean over scenes; None if a side has no run
-    by_scene: Mapping[str, Effect]
-    fewest: int  # runs on a side in a scene
-    p_value: float  # of the protocol's test
-    p_against: float  # of what contradicts: for `equal`, a difference beyond the margin
-
-    @property
-    def verdict(self) -> str:
-        """Returns "holds", "contradicted", `UNSEEN` or "can't be tested"."""
-        if self.effect is None:
-            return "can't be tested"
-        return self.effect.verdict_on(self.asked["expect"], self.p_value, self.p_against)
-
-
-class Claim(NamedTuple):
-    """A claim of the paper with its contrasts."""
-
-    number: int
-    text: str
-    limits: str
-    contrasts: Sequence[Contrast]
-
-    @property
-    def verdict(self) -> str:
-        """Returns the verdict on all of its contrasts."""
-        verdicts = {contrast.verdict for contrast in self.contrasts}
-        if len(verdicts) == 1:
-            return verdicts.pop()
-        if "holds" in verdicts:
-            return "holds in part"
-        return "contradicted" if "contradicted" in verdicts else UNSEEN
-
-
-def claims_of(
-    declared: Mapping[str, Any], studies: Studies, study: str = "main"
-) -> tuple[list[Claim], list[Claim]]:
-    """Returns the primary and secondary claims with their contrasts, of one protocol's runs."""
-    numbers = count(1)
-
-    def claim(entry: Mapping[str, Any]) -> Claim:
-        contrasts = [
-            _contrast(asked, studies[asked.get("study", study)], declared["scenes"])
-            for asked in entry["contrasts"]
-        ]
-        return Claim(next(numbers), entry["claim"], entry["limits"], contrasts)
-
-    primary, secondary = (list(map(claim, declared[of])) for of in ("primary", "secondary"))
-    together = [contrast for claim in primary for contrast in claim.contrasts]
-    corrected = (holm([getattr(c, name) for c in together]) for name in ("p_value", "p_against"))
-    for contrast, p_value, p_against in zip(together, *corrected):
-        contrast.p_value, contrast.p_against = p_value, p_against
-    return primary, secondary
-
-
-def _contrast(
-    asked: Mapping[str, Any], study: Mapping[str, Sequence[Run]], scenes: Sequence[str]
-) -> Contrast:
-    firsts = [asked["first"]] if isinstance(asked["first"], str) else asked["first"]
-    strata: dict[str, list[list[Array]]] = {}  # rates of both sides, by scene and first stack
-    for scene, here in study.items():
-        for first in firsts:
-            stacks = [first, *([asked["second"]] if "second" in asked else [])]
-            sides = scores([[run for run in here if run.stack == stack] for stack in stacks], asked)
-            if sides is not None and not np.isnan(np.concatenate(sides)).any():
-                strata.setdefault(scene, []).append(sides)
-    strata = {scene: sides for scene, sides in strata.items() if len(sides) == len(firsts)}
-    chosen = asked.get("scenes", scenes)
-    by_scene = {scene: effect(sides) for scene, sides in strata.items()}
-    if not {*chosen} <= {*strata}:
-        return Contrast(asked, None, by_scene, 0, float("nan"), float("nan"))
-    pairs = [sides for scene in chosen for sides in strata[scene]]
-    together, fewest = effect(pairs), min(len(side) for sides in pairs for side in sides)
-    if asked["expect"] == "equal":
-        p_values = together.p_within(asked["margin"]), together.p_beyond(asked["margin"])
-    else:
-        p_values = together.p_value, together.p_value
-    return Contrast(asked, together, by_scene, fewest, *p_values)
-
-
-def scores(sides: Sequence[Sequence[Run]], asked: Mapping[str, Any]) -> list[Array] | None:
-    """Returns the score of each run of each side, in one scene; None if a side has no run.
-
-    `asked` names the measure and its conditions as in claims.yaml. Scores are of the episodes that
-    all runs of all sides drove.
-    """
-    if not all(sides):
-        return None
-    kind = _measure(asked)
-    conditions = _conditions(sides[0][0], asked[kind])
-
-    def score(outcomes: Sequence[Any]) -> float:
-        if kind == "out_of_bounds":
-            return departures(outcomes)
-        rates = [success_rate([ends]) for ends in outcomes]
-        if kind == "kept":
-            return rates[0] / rates[1]
-        return float(np.dot(rates, [*asked[kind].values()]))
-
-    paired = paired_scores(sides, conditions, score)
-    return paired and paired[0]
-
-
-def _measure(asked: Mapping[str, Any]) -> str:
-    return next(name for name in ("success", "out_of_bounds", "kept") if name in asked)
-
-
-def _conditions(run: Run, names: Iterable[str | int]) -> list[Condition]:
-    """Returns greedy driving at each speed mode, or at each frame rate and the training speed."""
-    asked = [(n, run.fps) if isinstance(n, str) else (run.speed, float(n)) for n in names]
-    return [Condition("greedy", *condition) for condition in asked]
 
 
 def _as_trained(run: Run) -> Condition:
@@ -204,13 +80,65 @@ def claims_table(claims: Sequence[Claim], p_name: str) -> str:
     for claim in claims:
         effects = "<br>".join(map(effect_text, claim.contrasts))
         by_scene = "<br>".join(
-            ", ".join(f"{_SHORT[scene]}{_TIED}{signed(e.value)}" for scene, e in c.by_scene.items())
+            ", ".join(f"{SHORT[scene]}{_TIED}{signed(e.value)}" for scene, e in c.by_scene.items())
             for c in claim.contrasts
         )
         text = f"{claim.text}<br>*{claim.limits}*" if claim.limits else claim.text
         rows.append((str(claim.number), text, f"**{claim.verdict}**", effects, by_scene))
     header = ("", "claim, *what limits it*", "verdict", f"effect [95 %], {p_name}", "by scene")
     return _table(header, rows)
+
+
+def held_out_table(found: Sequence[HeldOut]) -> str:
+    """Returns the table of claims on held-out speeds."""
+    rows = []
+    for claim, permuted, collapsed, without in found:
+        (contrast,) = claim.contrasts
+        by_cell = (f"{name} {signed(e.value)}" for name, e in contrast.by_scene.items())
+        sides = " − ".join(_stack(contrast.asked[side]) for side in ("first", "second"))
+        left_out = points(without.effect.interval()) if any(collapsed) and without.effect else ""
+        number, text = f"H{claim.number}", f"{claim.text}: {sides}"
+        tested = f"**{claim.verdict}**", effect_text(contrast), p_text(permuted)
+        cells = ", ".join(cell.replace(" ", _TIED) for cell in by_cell)
+        rows.append((number, text, *tested, cells, " and ".join(map(str, collapsed)), left_out))
+    header = ("", "claim", "verdict", "effect [95 %], p (Holm)", "p by permutation")
+    return _table((*header, "by split and scene", "collapsed", "without these"), rows)
+
+
+def cell_table(cell: Cell) -> str:
+    """Returns success in one split and scene, by stack, at all speeds that it was tested at."""
+    first = cell.runs[0]
+    modes = (cell.mode, first.speed, *({*SPEEDS} - {cell.mode, first.speed}))
+    names = ("held out", "as in training", "the paper's training")
+    header = ["", *(f"{n}, {_speed_range(first, m)}" for n, m in zip(names, modes))]
+    conditions, rows = conditions_of(first, modes), []
+    for stack, runs in in_stacks(cell.runs).items():
+        found = (cell_of(runs, condition) for condition in conditions)
+        shares = [percent(each.score) if each else "" for each in found]
+        rows.append([_stack(stack), *shares, _each_run(runs, cell.mode)])
+    blind = [baseline_share(cell.runs, at._replace(policy="speed_blind")) for at in conditions]
+    percents = ["" if share is None else f"{100 * share:.0f}" for share in blind]
+    rows.append(["a planner blind to speed", *percents, ""])
+    return _table([*header, "each run, held out"], rows)
+
+
+def draw_held_out(cells: Sequence[Cell]) -> Figure:
+    """Returns success at the speeds of training and held out, a panel for each split and scene."""
+    grids = []
+    for cell in cells:
+        first, stacks = cell.runs[0], in_stacks(cell.runs)
+        conditions = conditions_of(first, (first.speed, cell.mode))
+        grid = grid_of(first.scene, stacks, conditions, ["speed_blind"])
+        shown = [c._replace(speed=name) for c, name in zip(conditions, ("as trained", "held out"))]
+        to = dict(zip(conditions, shown))
+        cells_shown, baselines_shown = (
+            {(name, to[condition]): share for (name, condition), share in shares.items()}
+            for shares in (grid.cells, grid.baselines)
+        )
+        grids.append(
+            SuccessGrid(cell.title, grid.series, tuple(shown), cells_shown, baselines_shown)
+        )
+    return draw_bars(grids)
 
 
 def protocols_table(narrow: Sequence[Claim], wide: Sequence[Claim], scene: str) -> str:
@@ -278,7 +206,7 @@ def draw_claims(claims: Sequence[Claim]) -> Figure:
 
 
 def _label(claim: Claim, contrast: Contrast) -> str:
-    asked, kind = contrast.asked, _measure(contrast.asked)
+    asked, kind = contrast.asked, measure_of(contrast.asked)
     sides = [asked[side] for side in ("first", "second") if side in asked]
     names = ["all stacks" if isinstance(x, list) else _stack(x).strip("`") for x in sides]
     what = {"out_of_bounds": "out of bounds", "kept": "share kept"}.get(kind, "")
@@ -349,7 +277,7 @@ def missed_ways(runs: Iterable[Run]) -> list[str]:
         worst = min(_ends_by_way(run), key=_share)
         if _share(worst) < _FOUND:
             end, _ = Counter(worst[worst != "success"].tolist()).most_common(1)[0]
-            seeds = missed.setdefault(f"{_stack(run.stack)} in {_SHORT[run.scene]}", [])
+            seeds = missed.setdefault(f"{_stack(run.stack)} in {SHORT[run.scene]}", [])
             seeds.append(f"{run.seed}: {100 * _share(worst):.0f} %, {words(end).lower()}")
     return [f"{name} ({'; '.join(seeds)})" for name, seeds in missed.items()]
 
@@ -366,13 +294,13 @@ def _share(ends: Array) -> float:
 
 
 def _successes(runs: Sequence[Run]) -> list[str]:
-    cells = [cell_of(runs, condition) for condition in _conditions(runs[0], SPEEDS)]
+    cells = [cell_of(runs, condition) for condition in conditions_of(runs[0], SPEEDS)]
     return [percent(cell.score) if cell else "" for cell in cells]
 
 
-def _each_run(runs: Sequence[Run]) -> str:
-    """Returns the runs' success at their training speed."""
-    cell = cell_of(runs, _as_trained(runs[0]))
+def _each_run(runs: Sequence[Run], speed: str = "") -> str:
+    """Returns the runs' success, at their training speed by default."""
+    cell = cell_of(runs, Condition("greedy", speed or runs[0].speed, runs[0].fps))
     return ", ".join(f"{100 * rate:.0f}" for rate in (cell.rates if cell else ()))
 
 
@@ -386,7 +314,7 @@ def failure_table(papers: Mapping[str, float], runs: Sequence[Run]) -> str:
     for stack in (stack for stack in papers if stack in here):
         members, shares = here[stack], []
         for speeds in (("low", "high"), ("normal",)):
-            of_runs = own_scores(members, _conditions(members[0], speeds), departures)
+            of_runs = own_scores(members, conditions_of(members[0], speeds), departures)
             shares.append(percent(mean_share([of_runs])) if len(of_runs) else "")
         rows.append((_stack(stack), f"{papers[stack]:.1f}", *shares, str(len(members))))
     return _table(("", "the paper", "low and high", "training", "runs"), rows)
@@ -449,7 +377,7 @@ def estimates_table(titles: Mapping[str, str], studies: Studies) -> str:
 def runs_table(studies: Studies) -> str:
     """Returns the number of runs of each stack in each study and scene."""
     columns = {
-        f"{'' if study == 'main' else study.replace('_', ' ')} {_SHORT[scene]}".strip(): members
+        f"{'' if study == 'main' else study.replace('_', ' ')} {SHORT[scene]}".strip(): members
         for study, scenes in studies.items()
         for scene, members in scenes.items()
     }
@@ -514,7 +442,7 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
 
     def beside(study: str, second: str, weights: Mapping[Any, int]) -> str:
         asked = {"first": "ego+obj", "second": second, "expect": "more", "success": weights}
-        return effect_text(_contrast(asked, studies[study], [*studies[study]]))
+        return effect_text(contrast_of(asked, studies[study], [*studies[study]]))
 
     every = [run for of in main.values() for run in of]
     failed = [r for r in every if _share(r.under(_as_trained(r))["outcome"]) < _HARDLY_EVER]
@@ -546,7 +474,7 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
                 {"{height_px} × {width_px}".format(**r.config["scene"]["camera"]) for r in every}
             ),
             frames=" or ".join(f"{n:,}" for n in sorted({run.total_frames for run in every})),
-            failed=[f"{_stack(r.stack)} in {_SHORT[r.scene]} (seed {r.seed})" for r in failed],
+            failed=[f"{_stack(r.stack)} in {SHORT[r.scene]} (seed {r.seed})" for r in failed],
             without=without(failed, declared, studies),
             episodes=sum(len(run.episodes["outcome"]) for run in runs),
             fewest=min(c.fewest for claim in primary for c in claim.contrasts),

@@ -13,7 +13,16 @@ pytest.importorskip("scipy", reason="reports are an extra")
 pytest.importorskip("jinja2", reason="reports are an extra")
 
 from docs import results
-from docs.results import Claim, Contrast, rate_table, scores
+from docs.claims import (
+    Claim,
+    Contrast,
+    claims_of,
+    held_out_cells,
+    held_out_claims,
+    scores,
+    studies_of,
+)
+from docs.results import rate_table
 from flowrep.report.runs import Run, groups_of
 from flowrep.report.sections import assemble
 from flowrep.report.statistics import UNSEEN, Effect
@@ -55,7 +64,7 @@ def declared_with(*contrasts, **changes):
 def claims(runs, *contrasts, **changes):
     """The primary and secondary claims."""
     declared = declared_with(*contrasts, **changes)
-    return results.claims_of(declared, results.studies_of(declared, runs))
+    return claims_of(declared, studies_of(declared, runs))
 
 
 def runs_with(**successes):
@@ -78,7 +87,7 @@ def test_a_studys_runs_have_names_like_any_of_its_patterns():
     names = ("road_raw_s12", "road_raw_s13", "road_all_s12", "turn_raw_s13")
     runs = [run_of(name, {"high": letters(8)}) for name in names]
     declared = {"studies": {"main": {"straight_road": "road_*_s13 road_all_*", "s_turn": "none_*"}}}
-    found = results.studies_of(declared, runs)
+    found = studies_of(declared, runs)
     assert {scene: [r.name for r in of] for scene, of in found["main"].items()} == {
         "straight_road": ["road_raw_s13", "road_all_s12"]
     }
@@ -171,13 +180,65 @@ def test_a_claim_of_several_contrasts_may_hold_in_part():
         assert Claim(1, "", "", contrasts).verdict == verdict
 
 
+def held_out_runs(successes, collapsed=()):
+    """Runs of two splits on Straight Road; in split B low speed is held out."""
+    runs = {}
+    for study, mode in (("fast", "high"), ("slow", "low")):
+        runs[study] = {"straight_road": []}
+        for stack, numbers in successes.items():
+            for seed, number in enumerate(numbers):
+                trained = 1 if (stack, seed) in collapsed else 6
+                ends = {mode: letters(number), "normal": letters(trained)}
+                run = run_of(f"{study}_{stack}_{seed}", ends, stack=stack, seed=seed)
+                runs[study]["straight_road"].append(run)
+    return runs
+
+
+HELD_OUT = {
+    "held_out": {
+        "splits": {
+            "fast": {"name": "A", "mode": "high"},
+            "slow": {"name": "B", "mode": "low"},
+        },
+        "claims": [
+            {"claim": "c", "first": "ego+obj", "second": "raw"},
+            {"claim": "d", "first": "raw", "second": "ego+obj"},
+        ],
+    }
+}
+
+
+def test_held_out_speeds_are_those_of_each_split_and_are_corrected_together():
+    studies = held_out_runs({"ego+obj": (6, 7, 0), "raw": (2, 3, 1)}, {("ego+obj", 2)})
+    first, second = held_out_claims(HELD_OUT, held_out_cells(HELD_OUT, studies))
+    (contrast,) = first.claim.contrasts
+    assert contrast.effect.value == pytest.approx(7 / 3 / 8)  # 13 of 24 against 6 of 24
+    assert {*contrast.by_scene} == {"A SR", "B SR"}
+    assert contrast.p_value == pytest.approx(2 * contrast.effect.p_value)
+    assert first.collapsed == (2, 0)  # one run in each split
+    assert first.without.effect.value == pytest.approx((6.5 - 2) / 8)
+    assert second.claim.contrasts[0].effect.value == -contrast.effect.value
+    assert "2 and 0" in results.held_out_table([first])
+
+
+def test_a_split_shows_held_out_speeds_first_and_its_figure_has_a_panel_each():
+    cells = held_out_cells(HELD_OUT, held_out_runs({"ego+obj": (6, 7), "raw": (2, 3)}))
+    header, _, raw, flow, blind = results.cell_table(cells[1]).splitlines()
+    assert header.split("|")[2].startswith("held out, 0.6")  # low speed
+    assert (raw.split("|")[-2], flow.split("|")[-2]) == ("25, 38", "75, 88")
+    assert blind.split("|")[2] == ""  # nobody drove it
+    panels = [axes for axes in results.draw_held_out(cells).axes if axes.get_visible()]
+    assert [axes.get_title() for axes in panels] == ["A, Straight Road", "B, Straight Road"]
+    assert [label.get_text() for label in panels[1].get_xticklabels()] == ["as trained", "held out"]
+
+
 def test_effects_without_some_runs_stand_beside_those_with_them():
     # [ego,obj] has 6, 7 and 0 of 8, and without the last 50 points more than [raw]
     runs = runs_with(both=(6, 7, 0), raw=(2, 3))
     left_out = [run for run in runs if run.stack == "ego+obj" and run.seed == 2]
     others = {"claim": "c", "contrasts": [HIGH | {"first": "raw"}], "limits": ""}
     declared = declared_with(HIGH, secondary=[others | {"contrasts": [HIGH]}, others])
-    told = results.without(left_out, declared, results.studies_of(declared, runs))
+    told = results.without(left_out, declared, studies_of(declared, runs))
     assert [(text.split()[0], text.split()[-2:]) for text in told] == [
         ("+50", ["row", "1"]),
         ("+50", ["row", "2"]),  # the third compares [raw] with itself
@@ -281,7 +342,7 @@ def test_the_page_says_what_the_stored_runs_say():
 def stored():
     if not is_archive(results.DATA):
         pytest.skip("source distributions have no runs")
-    return results.studies_of(DECLARED, read_archive(results.DATA))
+    return studies_of(DECLARED, read_archive(results.DATA))
 
 
 @pytest.mark.slow

@@ -212,7 +212,7 @@ def _bars(axes: Axes, grid: SuccessGrid) -> None:
             share = grid.baselines.get((name, condition))
             if share is not None:
                 ends = [group - 0.46, group + 0.46]
-                axes.plot(ends, [100 * share] * 2, line, color=_TEXT, linewidth=1.0)
+                axes.plot(ends, [100 * share] * 2, linestyle=line, color=_TEXT, linewidth=1.0)
     axes.set_xticks(range(len(grid.conditions)), [c.speed for c in grid.conditions])
     axes.set(xlim=(-0.5, len(grid.conditions) - 0.5), xlabel="pedestrians' speed mode")
     axes.tick_params(axis="x", length=0)

@@ -104,6 +104,21 @@ def effect(scenes: Sequence[Sequence[Array]]) -> Effect:
     return Effect(float(np.mean(means)), variance**0.5 / len(scenes), freedom)
 
 
+def permuted_p(scenes: Sequence[Sequence[Array]], draws: int = 20_000) -> float:
+    """Returns the two-sided p of no difference, by exchanging runs between the sides of each scene.
+
+    It assumes nothing of how runs spread, so it holds where a few of them end far from the others.
+    """
+    rng = np.random.default_rng(0)
+    totals = np.zeros(draws)
+    for first, second in scenes:
+        dealt = rng.permuted(np.tile(np.concatenate([first, second]), (draws, 1)), axis=1)
+        totals += dealt[:, : len(first)].mean(axis=1) - dealt[:, len(first) :].mean(axis=1)
+    seen = abs(effect(scenes).value)
+    # the deal that was seen is one of those that are possible
+    return float((1 + (abs(totals / len(scenes)) >= seen - 1e-9).sum()) / (1 + draws))
+
+
 def mean_share(scenes: Sequence[Array], episodes: int = 0) -> Estimate:
     """Returns the mean of rates over a scene's runs, averaged over scenes.
 

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("scipy", reason="reports are an extra")
 
-from flowrep.report.statistics import Effect, effect, holm, improvement, mean_share
+from flowrep.report.statistics import Effect, effect, holm, improvement, mean_share, permuted_p
 
 
 def rates(*values):
@@ -110,3 +110,12 @@ def test_holm_leaves_out_what_is_not_known():
     assert math.isnan(holm([0.02, math.nan])[1])
     assert holm([0.9, 0.8]) == [1.0, 1.0]
     assert holm([0.01, 0.04, 0.03]) == [0.03, 0.06, 0.06]  # in the order of the p values
+
+
+def test_exchanging_runs_tells_how_often_chance_alone_gives_as_much():
+    # 3 of 6 runs succeed: 2 of the 20 ways to deal them to two sides are as unequal as this one,
+    # and in two scenes alike, 2 of 400 are.
+    sides = rates(1, 1, 1), rates(0, 0, 0)
+    assert permuted_p([sides]) == pytest.approx(0.1, abs=0.01)
+    assert permuted_p([sides, sides]) == pytest.approx(0.005, abs=0.002)
+    assert permuted_p([(rates(1, 0), rates(0, 1))]) == 1.0

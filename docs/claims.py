@@ -1,0 +1,229 @@
+"""The claims that claims.yaml declares, tested on stored runs.
+
+`flowrep.report.statistics` decides whether a claim holds. A run counts with its success rate over
+the episodes that all compared runs drove.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatch
+from itertools import count
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flowrep.report.figures import words
+from flowrep.report.runs import SCENES, Condition, Run, departures, paired_scores, success_rate
+from flowrep.report.statistics import UNSEEN, Array, Effect, effect, holm, permuted_p
+
+SHORT = dict(zip(SCENES, ("SR", "ST", "H", "T")))
+_COLLAPSED = 0.2  # success at its training speeds below which a run counts as collapsed
+
+Studies = Mapping[str, Mapping[str, Sequence[Run]]]
+
+
+def studies_of(declared: Mapping[str, Any], runs: Sequence[Run]) -> Studies:
+    """Returns the finished runs of each study and scene, if there are any."""
+
+    def finished(patterns: str) -> list[Run]:
+        asked = [r for r in runs if any(fnmatch(r.name, p) for p in patterns.split())]
+        return [run for run in asked if run.is_finished]
+
+    return {
+        study: {s: of for s, patterns in of_scenes.items() if (of := finished(patterns))}
+        for study, of_scenes in declared["studies"].items()
+    }
+
+
+@dataclass
+class Contrast:
+    """One comparison that claims.yaml asks for, and its outcome.
+
+    p values are corrected if the claim is primary.
+    """
+
+    asked: Mapping[str, Any]
+    effect: Effect | None  # in the mean over scenes; None if a side has no run
+    by_scene: Mapping[str, Effect]
+    fewest: int  # runs on a side in a scene
+    p_value: float  # of the protocol's test
+    p_against: float  # of what contradicts: for `equal`, a difference beyond the margin
+
+    @property
+    def verdict(self) -> str:
+        """Returns "holds", "contradicted", `UNSEEN` or "can't be tested"."""
+        if self.effect is None:
+            return "can't be tested"
+        return self.effect.verdict_on(self.asked["expect"], self.p_value, self.p_against)
+
+
+class Claim(NamedTuple):
+    """A claim of the paper with its contrasts."""
+
+    number: int
+    text: str
+    limits: str
+    contrasts: Sequence[Contrast]
+
+    @property
+    def verdict(self) -> str:
+        """Returns the verdict on all of its contrasts."""
+        verdicts = {contrast.verdict for contrast in self.contrasts}
+        if len(verdicts) == 1:
+            return verdicts.pop()
+        if "holds" in verdicts:
+            return "holds in part"
+        return "contradicted" if "contradicted" in verdicts else UNSEEN
+
+
+def claims_of(
+    declared: Mapping[str, Any], studies: Studies, study: str = "main"
+) -> tuple[list[Claim], list[Claim]]:
+    """Returns the primary and secondary claims with their contrasts, of one protocol's runs."""
+    numbers = count(1)
+
+    def claim(entry: Mapping[str, Any]) -> Claim:
+        contrasts = [
+            contrast_of(asked, studies[asked.get("study", study)], declared["scenes"])
+            for asked in entry["contrasts"]
+        ]
+        return Claim(next(numbers), entry["claim"], entry["limits"], contrasts)
+
+    primary, secondary = (list(map(claim, declared[of])) for of in ("primary", "secondary"))
+    together = [contrast for claim in primary for contrast in claim.contrasts]
+    corrected = (holm([getattr(c, name) for c in together]) for name in ("p_value", "p_against"))
+    for contrast, p_value, p_against in zip(together, *corrected):
+        contrast.p_value, contrast.p_against = p_value, p_against
+    return primary, secondary
+
+
+def contrast_of(
+    asked: Mapping[str, Any], study: Mapping[str, Sequence[Run]], scenes: Sequence[str]
+) -> Contrast:
+    """Returns a contrast in the mean over scenes, with the runs of a study."""
+    firsts = [asked["first"]] if isinstance(asked["first"], str) else asked["first"]
+    strata: dict[str, list[list[Array]]] = {}  # rates of both sides, by scene and first stack
+    for scene, here in study.items():
+        for first in firsts:
+            sides = scores(_sides(asked | {"first": first}, here), asked)
+            if sides is not None and not np.isnan(np.concatenate(sides)).any():
+                strata.setdefault(scene, []).append(sides)
+    strata = {scene: sides for scene, sides in strata.items() if len(sides) == len(firsts)}
+    return _over(asked, strata, asked.get("scenes", scenes))
+
+
+def _sides(asked: Mapping[str, Any], runs: Sequence[Run]) -> list[list[Run]]:
+    stacks = [asked[side] for side in ("first", "second") if side in asked]
+    return [[run for run in runs if run.stack == stack] for stack in stacks]
+
+
+def _over(
+    asked: Mapping[str, Any], strata: Mapping[str, list[list[Array]]], chosen: Sequence[str]
+) -> Contrast:
+    by_scene = {scene: effect(sides) for scene, sides in strata.items()}
+    if not {*chosen} <= {*strata}:
+        return Contrast(asked, None, by_scene, 0, float("nan"), float("nan"))
+    pairs = [sides for scene in chosen for sides in strata[scene]]
+    together, fewest = effect(pairs), min(len(side) for sides in pairs for side in sides)
+    if asked["expect"] == "equal":
+        p_values = together.p_within(asked["margin"]), together.p_beyond(asked["margin"])
+    else:
+        p_values = together.p_value, together.p_value
+    return Contrast(asked, together, by_scene, fewest, *p_values)
+
+
+class Cell(NamedTuple):
+    """A split of the speeds in one scene, for the study of held-out speeds."""
+
+    name: str  # "A SR"
+    title: str
+    mode: str  # the speed mode that training left out
+    runs: Sequence[Run]
+
+
+class HeldOut(NamedTuple):
+    """A claim on held-out speeds."""
+
+    claim: Claim
+    permuted: float  # p
+    collapsed: tuple[int, int]  # runs of each side
+    without: Contrast  # those runs
+
+
+def held_out_cells(declared: Mapping[str, Any], studies: Studies) -> list[Cell]:
+    """Returns the runs of each split and scene."""
+    splits = declared["held_out"]["splits"]
+    return [
+        Cell(
+            f"{split['name']} {SHORT[scene]}",
+            f"{split['name']}, {words(scene)}",
+            split["mode"],
+            runs,
+        )
+        for study, split in splits.items()
+        for scene, runs in studies[study].items()
+    ]
+
+
+def held_out_claims(declared: Mapping[str, Any], cells: Sequence[Cell]) -> list[HeldOut]:
+    """Returns the claims on held-out speeds, in the mean over cells, corrected together."""
+    found = []
+    for number, entry in enumerate(declared["held_out"]["claims"], start=1):
+        asked = entry | {"expect": "more", "success": {"held out": 1}}
+        every, without, lost = {}, {}, np.zeros(2, int)
+        for cell in cells:
+            sides, measure = _sides(asked, cell.runs), {"success": {cell.mode: 1}}
+            left = [[run for run in side if not is_collapsed(run)] for side in sides]
+            lost += [len(side) - len(kept) for side, kept in zip(sides, left)]
+            for strata, runs in ((every, sides), (without, left)):
+                rates = scores(runs, measure)
+                strata |= {cell.name: [rates]} if rates else {}
+        names = [cell.name for cell in cells]
+        contrast = _over(asked, every, names)
+        p = permuted_p([pair for pairs in every.values() for pair in pairs])
+        claim = Claim(number, entry["claim"], "", [contrast])
+        found.append(HeldOut(claim, p, tuple(lost.tolist()), _over(asked, without, names)))
+    together = [each.claim.contrasts[0] for each in found]
+    for contrast, p in zip(together, holm([contrast.p_value for contrast in together])):
+        contrast.p_value = contrast.p_against = p
+    return found
+
+
+def is_collapsed(run: Run) -> bool:
+    """Returns whether a run hardly drives, even with people at its training speeds."""
+    driven = run.under(Condition("greedy", run.speed, run.fps))["outcome"]
+    return not len(driven) or success_rate([driven]) < _COLLAPSED
+
+
+def scores(sides: Sequence[Sequence[Run]], asked: Mapping[str, Any]) -> list[Array] | None:
+    """Returns the score of each run of each side, in one scene; None if a side has no run.
+
+    `asked` names the measure and its conditions as in claims.yaml. Scores are of the episodes that
+    all runs of all sides drove.
+    """
+    if not all(sides):
+        return None
+    kind = measure_of(asked)
+    conditions = conditions_of(sides[0][0], asked[kind])
+
+    def score(outcomes: Sequence[Any]) -> float:
+        if kind == "out_of_bounds":
+            return departures(outcomes)
+        rates = [success_rate([ends]) for ends in outcomes]
+        if kind == "kept":
+            return rates[0] / rates[1]
+        return float(np.dot(rates, [*asked[kind].values()]))
+
+    paired = paired_scores(sides, conditions, score)
+    return paired and paired[0]
+
+
+def measure_of(asked: Mapping[str, Any]) -> str:
+    """Returns the name of what a contrast compares."""
+    return next(name for name in ("success", "out_of_bounds", "kept") if name in asked)
+
+
+def conditions_of(run: Run, names: Iterable[str | int]) -> list[Condition]:
+    """Returns greedy driving at each speed mode, or at each frame rate and the training speed."""
+    asked = [(n, run.fps) if isinstance(n, str) else (run.speed, float(n)) for n in names]
+    return [Condition("greedy", *condition) for condition in asked]
