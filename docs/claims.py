@@ -14,7 +14,7 @@ import numpy as np
 
 from flowrep.report.figures import words
 from flowrep.report.runs import SCENES, Condition, Run, departures, paired_scores, success_rate
-from flowrep.report.statistics import UNSEEN, Array, Effect, effect, holm, permuted_p
+from flowrep.report.statistics import UNSEEN, Array, Effect, effect, holm, improvement, permuted_p
 
 SHORT = dict(zip(SCENES, ("SR", "ST", "H", "T")))
 _COLLAPSED = 0.2  # success at its training speeds below which a run counts as collapsed
@@ -48,6 +48,9 @@ class Contrast:
     fewest: int  # runs on a side in a scene
     p_value: float  # of the protocol's test
     p_against: float  # of what contradicts: for `equal`, a difference beyond the margin
+    higher: float = float(
+        "nan"
+    )  # how often a run of the first side is higher than one of the other
 
     @property
     def verdict(self) -> str:
@@ -129,7 +132,8 @@ def _over(
         p_values = together.p_within(asked["margin"]), together.p_beyond(asked["margin"])
     else:
         p_values = together.p_value, together.p_value
-    return Contrast(asked, together, by_scene, fewest, *p_values)
+    higher = improvement(pairs) if "second" in asked else float("nan")
+    return Contrast(asked, together, by_scene, fewest, *p_values, higher)
 
 
 class Cell(NamedTuple):

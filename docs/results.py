@@ -4,6 +4,7 @@ claims.py tests what claims.yaml declares, results.md.jinja has the words around
 all numbers come from the packed runs.
 """
 
+import csv
 import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -49,7 +50,7 @@ from flowrep.report.runs import (
     own_scores,
     success_rate,
 )
-from flowrep.report.statistics import LEVEL, Array, Effect, mean_share
+from flowrep.report.statistics import LEVEL, Array, Effect, Estimate, mean_share
 from flowrep.report.storage import read_archive
 from flowrep.report.tables import Table, p_text, percent, points, signed
 
@@ -57,6 +58,7 @@ HERE = Path(__file__).parent
 DATA, PAGE = HERE.parent / "outputs" / "reference", HERE / "results.md"
 FIGURE, HELD_OUT_FIGURE = "images/results_claims.svg", "images/results_held_out.svg"
 CLAIMS = HERE / "claims.yaml"
+EARLIER = "earlier_verdicts.csv"  # on rows 1 to 8, of runs that are no longer stored
 _COLOURS = dict(zip(SCENES, ("#0072b2", "#e69f00", "#009e73", "#cc79a7")))
 _STUDY = {"resolution": ", 84 px", "wide_confirmation": ", 0.6–2.4 m/s"}  # in the figure
 _TIED = "\u00a0"  # a space at which no line breaks
@@ -74,6 +76,11 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return Table("", "", tuple(header), (("", tuple(map(tuple, rows))),)).to_markdown()
 
 
+def share(value: float) -> str:
+    """Returns a share with two digits, "" if it is unknown."""
+    return "" if np.isnan(value) else f"{value:.2f}"
+
+
 def claims_table(claims: Sequence[Claim], p_name: str) -> str:
     """Returns the table of claims in Markdown, a line for each contrast within a cell."""
     rows = []
@@ -84,9 +91,25 @@ def claims_table(claims: Sequence[Claim], p_name: str) -> str:
             for c in claim.contrasts
         )
         text = f"{claim.text}<br>*{claim.limits}*" if claim.limits else claim.text
-        rows.append((str(claim.number), text, f"**{claim.verdict}**", effects, by_scene))
-    header = ("", "claim, *what limits it*", "verdict", f"effect [95 %], {p_name}", "by scene")
+        higher = "<br>".join(share(contrast.higher) for contrast in claim.contrasts)
+        rows.append((str(claim.number), text, f"**{claim.verdict}**", effects, higher, by_scene))
+    header = ("", "claim, *what limits it*", "verdict", f"effect [95 %], {p_name}", "P(higher)")
+    header += ("by scene",)
     return _table(header, rows)
+
+
+def recipes_table(primary: Sequence[Claim], earlier: Mapping[int, Mapping[str, str]]) -> str:
+    """Returns the verdicts on the primary claims with the recipe before and with this one."""
+    rows = []
+    for claim in primary:
+        of, contrast = earlier[claim.number], claim.contrasts[0]
+        value, low, high = (float(of[key]) / 100 for key in ("effect", "low", "high"))
+        before = points(Estimate(value, low, high)), p_text(float(of["p"])), f"**{of['verdict']}**"
+        now = points(contrast.effect.interval()) if contrast.effect else ""
+        tested = now, p_text(contrast.p_value), f"**{claim.verdict}**"
+        rows.append((_label(claim, contrast), *before, *tested))
+    header = ("row", "before: effect [95 %]", "p (Holm)", "verdict")
+    return _table((*header, "these presets: effect [95 %]", "p (Holm)", "verdict"), rows)
 
 
 def held_out_table(found: Sequence[HeldOut]) -> str:
@@ -446,6 +469,8 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
 
     every = [run for of in main.values() for run in of]
     failed = [r for r in every if _share(r.under(_as_trained(r))["outcome"]) < _HARDLY_EVER]
+    with (DATA / EARLIER).open(encoding="utf-8", newline="") as file:
+        earlier = {int(row["row"]): row for row in csv.DictReader(file)}
     smallest = smallest_differences(primary) or [float("nan")]
     text = (
         TEMPLATES.overlay(loader=FileSystemLoader(HERE))
@@ -453,6 +478,7 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
         .render(
             primary=claims_table(primary, "p (Holm)"),
             secondary=claims_table(secondary, "p"),
+            recipes=recipes_table(primary, earlier),
             # row 14 against the paper's other stack of two frames, row 19 at each speed alone
             against_depth=beside("frame_rate", "depth2", {12: 1, 6: -1}),
             alone={speed: beside("wide_confirmation", "raw", {speed: 1}) for speed in SPEEDS},

@@ -318,6 +318,20 @@ def test_a_protocol_stands_beside_the_other_with_its_own_verdict():
     assert row.replace("\u00a0", " ") == f"|{'|'.join(cells)}|**contradicted**|"
 
 
+def test_earlier_verdicts_stand_beside_those_of_this_recipe():
+    (claim,), _ = claims(runs_with(both=(6, 7), raw=(2, 3)), HIGH)
+    before = {"effect": "9", "low": "5", "high": "12", "p": "0.003", "verdict": "holds"}
+    row = results.recipes_table([claim], {1: before}).splitlines()[-1].replace("\u00a0", " ")
+    assert row.split("|")[2:4] == ["+9 [+5, +12], p = 0.003", "**holds**"]
+    assert row.split("|")[4].startswith("+50 [")
+
+
+def test_pairs_of_runs_show_how_often_the_first_side_is_higher():
+    # 6 and 2 against 2 and 3: of the four pairs two are higher and one is a tie
+    (claim,), _ = claims(runs_with(both=(6, 2), raw=(2, 3)), HIGH)
+    assert claim.contrasts[0].higher == pytest.approx(2.5 / 4)
+
+
 def test_the_primary_contrasts_are_those_of_the_protocol():
     text = (results.PAGE.parent / "protocol.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| \d+ \| .*$", text, re.MULTILINE)
