@@ -48,9 +48,7 @@ class Contrast:
     fewest: int  # runs on a side in a scene
     p_value: float  # of the protocol's test
     p_against: float  # of what contradicts: for `equal`, a difference beyond the margin
-    higher: float = float(
-        "nan"
-    )  # how often a run of the first side is higher than one of the other
+    higher: float = float("nan")  # how often a run of the first side beats one of the second
 
     @property
     def verdict(self) -> str:

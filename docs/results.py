@@ -104,12 +104,11 @@ def recipes_table(primary: Sequence[Claim], earlier: Mapping[int, Mapping[str, s
     for claim in primary:
         of, contrast = earlier[claim.number], claim.contrasts[0]
         value, low, high = (float(of[key]) / 100 for key in ("effect", "low", "high"))
-        before = points(Estimate(value, low, high)), p_text(float(of["p"])), f"**{of['verdict']}**"
-        now = points(contrast.effect.interval()) if contrast.effect else ""
-        tested = now, p_text(contrast.p_value), f"**{claim.verdict}**"
-        rows.append((_label(claim, contrast), *before, *tested))
-    header = ("row", "before: effect [95 %]", "p (Holm)", "verdict")
-    return _table((*header, "these presets: effect [95 %]", "p (Holm)", "verdict"), rows)
+        before = f"{points(Estimate(value, low, high))}, p = {of['p']}", f"**{of['verdict']}**"
+        verdict = claim.verdict.removesuffix(" with this recipe")
+        now = effect_text(contrast), f"**{verdict}**"
+        rows.append((_label(claim, contrast), *before, *now))
+    return _table(("row", "before, p (Holm)", "verdict", "now, p (Holm)", "verdict"), rows)
 
 
 def held_out_table(found: Sequence[HeldOut]) -> str:
