@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Categorical
 
-import flowrep.envs  # noqa: F401 - gymnasium learns the streets' names
+import flowrep.envs  # noqa: F401 - registers the streets with gymnasium
 
 GAMMA, LAMBDA, CLIP, EPOCHS, MINIBATCHES = 0.99, 0.95, 0.1, 4, 4
 ENTROPY_WEIGHT, VALUE_WEIGHT, MAX_GRAD_NORM, LEARNING_RATE = 0.01, 0.5, 0.5, 2.5e-4
@@ -37,7 +37,7 @@ class Agent(nn.Module):
 def collect(
     envs: gym.vector.VectorEnv, agent: Agent, seen: Tensor, ended: Tensor, length: int
 ) -> tuple[dict[str, Tensor], Tensor, Tensor]:
-    """Returns a rollout [T, N] by name, and the observation and flags that come after it."""
+    """Returns a rollout, [T, N] per name, and the observation and flags after its last step."""
     steps = []
     for _ in range(length):
         with torch.no_grad():
@@ -65,11 +65,11 @@ def advantages(rollout: dict[str, Tensor], next_value: Tensor, next_ended: Tenso
 
 
 def update(agent: Agent, optimizer: torch.optim.Optimizer, batch: dict[str, Tensor]) -> float:
-    """Takes the epochs over one rollout; returns the last loss."""
+    """Trains for several epochs on one rollout; returns the last loss."""
     for _ in range(EPOCHS):
         for picked in torch.randperm(len(batch["action"])).chunk(MINIBATCHES):
             part = {name: values[picked] for name, values in batch.items()}
-            # An env's first step after an end only resets it: gymnasium ignores the action.
+            # The step after the end of an episode only resets the env; gymnasium ignores its action.
             counts = 1 - part["ended"]
             policy, value = agent(part["seen"])
             ratio = (policy.log_prob(part["action"]) - part["log_prob"]).exp()
@@ -96,7 +96,7 @@ def train(steps: int, num_envs: int = 4, rollout_length: int = 128, seed: int = 
     observation, _ = envs.reset(seed=seed)
     seen, ended = torch.as_tensor(observation), torch.zeros(num_envs)
     agent = Agent(seen.shape[1], int(envs.single_action_space.n))
-    agent(seen)  # gives the lazy layer its size
+    agent(seen)  # the first call sets the size of the lazy layer
     optimizer = torch.optim.Adam(agent.parameters(), lr=LEARNING_RATE, eps=1e-5)
     for done in range(0, steps, num_envs * rollout_length):
         rollout, seen, ended = collect(envs, agent, seen, ended, rollout_length)

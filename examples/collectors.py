@@ -1,12 +1,12 @@
-"""Frames for one learner from several processes or machines, by TorchRL's collectors.
+"""Collects frames for one agent in several processes or machines, by TorchRL's collectors.
 
     pip install '.[sim]'
     python examples/collectors.py process 1 2 4   # processes of this machine
     pip install ray
     python examples/collectors.py ray 1 2 4       # Ray's workers, of the cluster in RAY_ADDRESS
 
-Each worker has a batch of streets and computes their flow, so that what travels are the maps that
-the agent reads. Prints the frames per second of each number of workers.
+Each worker has a batch of streets and computes their flow, so it sends only the maps that the agent
+reads. The program prints the frames per second for each number of workers.
 """
 
 import sys
@@ -24,17 +24,17 @@ NUM_ENVS, STEPS, BATCHES = 16, 16, 16
 
 
 def streets(seed: int) -> TransformedEnv:
-    """Returns one worker's streets. Seeds differ, or all workers would drive the same episodes."""
+    """Returns one worker's streets; each worker needs another seed, for other episodes."""
     torch.set_num_threads(1)  # a core for each worker
     return make_env("straight_road", ["ego", "obj"], num_envs=NUM_ENVS, seed=seed)
 
 
 def make_collector(backend: str, workers: int) -> Collector:
-    """Returns a collector that gives the frames of all workers, step by step, as one batch."""
+    """Returns a collector whose batches join the frames of all workers."""
     on_ray = {"remote_configs": {"num_cpus": 1, "num_gpus": 0}}
     return Collector(
         [partial(streets, seed) for seed in range(workers)],
-        None,  # random actions; a policy of yours is sent to the workers
+        None,  # random actions; a policy would be sent to the workers
         backend=backend,
         num_collectors=workers,
         sync=True,
@@ -45,7 +45,7 @@ def make_collector(backend: str, workers: int) -> Collector:
 
 
 def frames_per_s(backend: str, workers: int) -> float:
-    """Returns the median over some batches, after a first one in which the workers start."""
+    """Returns the median over several batches, after a first one during which the workers start."""
     collector, rates = make_collector(backend, workers), []
     batches = iter(collector)
     next(batches)

@@ -1,7 +1,7 @@
-"""Ego and object flow in a gymnasium env of your own, through TorchRL's GymEnv.
+"""Ego and object flow in your own gymnasium env, through TorchRL's GymEnv.
 
-The env below has a wall, a square rising in front of it, and a moving camera. It returns depth, ids
-and poses, but no flow. flowrep's transforms need nothing else.
+The env below has a wall, a square that rises in front of it, and a moving camera. It returns depth,
+ids and poses, which are all that flowrep's transforms need to compute flow.
 
     python examples/gym_env.py
 """
@@ -49,7 +49,7 @@ class Drift(gym.Env):
         return self.observe(), 0.0, False, self.steps == 8, {}
 
     def observe(self) -> dict[str, dict[str, np.ndarray]]:
-        # Where each pixel's ray meets the plane of the square, from the pixels' centres.
+        # The points where the rays through the pixels' centres meet the plane of the square.
         x = (np.arange(WIDTH) + 0.5 - WIDTH / 2) / FOCAL_PX * SQUARE_M + self.camera[0, 3]
         y = (np.arange(HEIGHT)[:, None] + 0.5 - HEIGHT / 2) / FOCAL_PX * SQUARE_M
         offset = np.maximum(abs(x - self.square[0, 3]), abs(y - self.square[1, 3]))

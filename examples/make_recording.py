@@ -1,10 +1,10 @@
-"""A small recording to try `flowrep.factorize` on: ten frames of a street with people.
+"""Writes a small recording to try `flowrep.factorize` on: ten frames of a street with people.
 
     python examples/make_recording.py street
     python -m flowrep.factorize input=street format=frames output=out
 
-It holds pictures, depth, the camera's poses and the simulator's own flow, so that `flow=exact`,
-`poses=estimated` and wrong options (`format.pose_axes=opengl`) can be tried as well.
+It contains pictures, depth, the camera's poses and the simulator's exact flow, so you can also try
+`flow=exact`, `poses=estimated` and wrong options (`format.pose_axes=opengl`).
 """
 
 import argparse
@@ -33,7 +33,7 @@ def make_recording(
     skipped: int = 20,
     seed: int = 0,
 ) -> None:
-    """Writes a folder in the layout of `format=frames`, from a drive of the planner.
+    """Records a drive of the planner in a folder with the layout of `format=frames`.
 
     Args:
         folder: the new folder.
@@ -41,7 +41,7 @@ def make_recording(
         frames: the number of frames.
         size: height and width of the pictures.
         skipped: steps before the first frame.
-        seed: the episode's.
+        seed: of the episode.
     """
     folder, street = Path(folder), load_scene(scene)
     camera = replace(street.camera, height_px=size[0], width_px=size[1])

@@ -21,9 +21,9 @@ from flowrep import diagnose, transforms
 
 
 class ManiSkillEnv(EnvBase):
-    """A batch of ManiSkill's environments, with one camera's maps and the poses of all bodies.
+    """A batch of ManiSkill envs, which emits one camera's maps and the poses of all bodies.
 
-    TorchRL's `GymWrapper` takes a ManiSkill env of one environment for an unbatched one.
+    Unlike TorchRL's `GymWrapper`, it keeps the batch dimension if there is only one env.
 
     | writes under `"sensor"` | shape | from |
     | --- | --- | --- |
@@ -34,7 +34,7 @@ class ManiSkillEnv(EnvBase):
     | `opengl_pose` | float32 `[N, 4, 4]`, camera to world | `cam2world_gl` |
     | `K` | float32 `[N, 3, 3]`, pixel centres at halves | `intrinsic_cv` |
 
-    `flow_transforms()` makes raw, ego and obj of them. A part of the robot that moves with the
+    `flow_transforms()` compute raw, ego and obj from these. A part of the robot that moves with the
     camera stands still in the picture, so its object flow is minus the ego flow.
 
     Args:
@@ -123,7 +123,7 @@ def flow_transforms() -> Compose:
 
 
 def make_env(task: str = "PickCube-v1", camera: str = "hand_camera") -> TransformedEnv:
-    """Returns a task as a TorchRL env that writes raw, ego and obj as its camera sees them."""
+    """Returns a task as a TorchRL env that writes raw, ego and obj of its camera."""
     import mani_skill.envs  # noqa: F401 - registers the envs
 
     robot = {"robot_uids": "panda_wristcam"} if camera == "hand_camera" else {}

@@ -1,4 +1,4 @@
-"""Ego and object flow in MiniWorld, whose maps and poses take three lines each.
+"""Ego and object flow in MiniWorld, where maps and poses take three lines of code each.
 
     pip install '.[examples]'
     apt-get install libegl1 libgl1-mesa-dri
@@ -9,8 +9,8 @@ tests/examples/test_other_simulators.py:
 
 - depth is metres along the optical axis, from a 16-bit z-buffer: steps of 4 cm at 10 m;
 - y is up and an agent's `dir` is an angle about it; camera axes are OpenGL's;
-- pictures are multisampled, which shifts depth by 0.38 px: a frame buffer of one sample doesn't;
-- there are no ids, so a body is where depth changes when the room is drawn without it.
+- pictures are multisampled, which shifts depth by 0.38 px; a frame buffer with one sample doesn't;
+- there are no ids, so the room is also drawn without the body, and the body is where depth differs.
 """
 
 import os
@@ -40,7 +40,7 @@ CAMERA = ("sensor", "world_from_camera")
 
 
 class Room(gym.Wrapper):
-    """MiniWorld's room with a box that slides from wall to wall; it gives maps and poses."""
+    """MiniWorld's room with a box that slides from wall to wall, as maps and poses."""
 
     def __init__(self) -> None:
         super().__init__(OneRoom(size=8, domain_rand=False))
@@ -104,7 +104,7 @@ def make_env() -> TransformedEnv:
 
 
 def drive(env: TransformedEnv, steps: int = 18) -> TensorDictBase:
-    """Returns the frames of a drive ahead that turns a little to either side."""
+    """Returns the frames of a drive ahead with small turns to both sides."""
     actions = cycle([FORWARD, LEFT, FORWARD, RIGHT])
     env.set_seed(1)
     return env.rollout(steps, lambda td: td.set("action", torch.tensor(next(actions))))["next"]

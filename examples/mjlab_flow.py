@@ -1,18 +1,18 @@
-"""Ego and object flow in mjlab, for all of its environments at once: a robot's wrist camera.
+"""Ego and object flow of wrist cameras in mjlab, for a batch of envs at once.
 
     pip install '.[examples]' mjlab
     python examples/mjlab_flow.py strip.png
 
-It runs on a CPU, which mjlab has "for development". At the first start Warp compiles its kernels,
-for some minutes.
+It runs on a CPU, which mjlab supports "for development". At the first start, Warp compiles its
+kernels for some minutes.
 
-A group of mjlab's observations holds what flow needs; TorchRL's `MJLabWrapper` passes it on, and
-`sensors_from("mjlab")` has its conventions. What else has to be known:
+An mjlab observation group contains what flow needs. TorchRL's `MJLabWrapper` passes it on, and
+`sensors_from("mjlab")` converts its conventions. Note that:
 
-- spaces are of float32, so ids are sent as such, and cast here;
-- a geom moves as its body: geoms that share a body have the same pose;
-- a camera with a sensor size in MuJoCo's model, as this one, has K from that, not from `fovy`. The
-  renderer crops the sensor to the picture's aspect ratio.
+- all spaces are float32, so ids arrive as floats, and are converted here;
+- a geom moves with its body, so geoms that share a body have the same pose;
+- if a camera has a sensor size in MuJoCo's model, as here, K follows from it and not from `fovy`.
+  The renderer crops the sensor to the picture's aspect ratio.
 """
 
 import sys
@@ -36,7 +36,7 @@ TASK, WRIST = "Mjlab-Lift-Cube-Yam", "robot/camera_d405"
 
 
 def intrinsics(env: Any) -> Tensor:
-    """Returns K of the wrist's camera, whose focal lengths and sensor MuJoCo has in metres."""
+    """Returns K of the wrist camera from its focal lengths and sensor size, in metres in MuJoCo."""
     model, camera = env.sim.mj_model, env.scene["eye"].camera_idx
     width_m, height_m = model.cam_sensorsize[camera]
     px_per_m = max(WIDTH / width_m, HEIGHT / height_m)  # cropped to the picture's aspect ratio
@@ -77,7 +77,7 @@ def make_env(num_envs: int = 2) -> TransformedEnv:
         height=HEIGHT,
         width=WIDTH,
         data_types=("depth", "segmentation"),
-        enabled_geom_groups=(0, 3),  # the robot by its collision shapes, as mjlab's own task does
+        enabled_geom_groups=(0, 3),  # draw the robot's collision shapes, as mjlab's task does
     )
     config.scene.sensors = (*config.scene.sensors, eye)
     terms = {

@@ -1,21 +1,21 @@
-"""Ego and object flow in a simulator that knows nothing of flowrep: MuJoCo.
+"""Ego and object flow in MuJoCo.
 
 A camera moves through a yard in which a ball rolls, a door swings and a crate slides. MuJoCo
-renders depth and segmentation off-screen and gives the poses of the camera and bodies, from which
-flowrep's transforms compute flow.
+renders depth and segmentation off-screen, and reports the poses of the camera and the bodies.
+flowrep's transforms compute flow from these.
 
     pip install '.[examples]'
     apt-get install libegl1 libgl1-mesa-dri     # off-screen, on a CPU; or libosmesa6
     MUJOCO_GL=egl python examples/mujoco_flow.py strip.png
 
-MuJoCo's conventions, which `sensors_from("mujoco")` has, as tests/examples/test_mujoco_flow.py
-measures them:
+`sensors_from("mujoco")` converts MuJoCo's conventions, which tests/examples/test_mujoco_flow.py
+measures:
 
 - depth is already metres along the optical axis; pixels without a surface hold the far plane;
 - pixels are sampled at their centres, so K has cx = W / 2, cy = H / 2 (with `offsamples="0"`);
 - camera axes are OpenGL's (x right, y up, z backward), poses are camera-to-world;
 - a body's pose is a position and a quaternion (w, x, y, z);
-- segmentation is (geom id, object type) a pixel, -1 for the sky.
+- segmentation is (geom id, object type) per pixel, -1 for the sky.
 """
 
 import math
@@ -76,7 +76,7 @@ SCENE = f"""
 </mujoco>
 """  # noqa: E501
 START_VELOCITIES = {"ball": (-1.0, 0.4, 0.0), "hinge": -1.0, "rail": -1.2}
-BODIES = ("ball", "door", "crate")  # the moving bodies; the rest is the static world
+BODIES = ("ball", "door", "crate")  # the moving bodies; all others are the static world
 
 
 class Yard(gym.Env):
@@ -119,7 +119,7 @@ class Yard(gym.Env):
         self.data.mocap_quat[0] = math.cos(half), 0.0, 0.0, math.sin(half)
         for _ in range(SUBSTEPS):
             mujoco.mj_step(self.model, self.data)
-        mujoco.mj_forward(self.model, self.data)  # poses that belong to the final positions
+        mujoco.mj_forward(self.model, self.data)  # so that poses belong to the final positions
         return self.observe(), 0.0, False, self.data.time > 2.0, {}
 
     def observe(self) -> dict[str, Any]:
@@ -155,7 +155,7 @@ class Yard(gym.Env):
 
 
 def make_env() -> TransformedEnv:
-    """Returns the yard as a TorchRL env that writes raw, ego and obj beside MuJoCo's data."""
+    """Returns the yard as a TorchRL env that adds raw, ego and obj to MuJoCo's data."""
     yard = Yard()
     standing = [geom for geom in range(yard.model.ngeom) if geom not in yard.geom_ids]
     transforms = Compose(

@@ -1,18 +1,18 @@
 """Ego and object flow in Newton, for several worlds at once.
 
-In each world a ball flies by and a crate tumbles, before a camera that moves through the yard.
+In each world, a ball flies by and a crate tumbles in front of a camera that moves through the yard.
 
     pip install '.[examples]' newton
     python examples/newton_flow.py strip.png
 
-It runs on a CPU. At the first start Warp compiles Newton's kernels, for a minute or more.
+It runs on a CPU. The first start takes a minute or more, because Warp compiles Newton's kernels.
 
-`sensors_from("newton")` has Newton's conventions. What else has to be known:
+`sensors_from("newton")` converts Newton's conventions. Note that:
 
-- ids are those of shapes, counted through all worlds, so a shape's id differs between worlds;
-- a camera sees the shapes of its world, and those of no world (here the floor), from the bounds of
-  the last `bvh_refit_shapes`: without it, the picture is an old one;
-- shapes have no poses of their own in a state: `body_q` has those of bodies.
+- ids number the shapes of all worlds consecutively, so a shape has another id in each world;
+- a camera sees the shapes of its world, and those that belong to no world (here the floor);
+- call `bvh_refit_shapes` before rendering, or the picture shows old positions;
+- a state has the poses of bodies (`body_q`), not of shapes.
 """
 
 import math
@@ -40,7 +40,7 @@ FLOOR = 0  # the first shape
 
 
 class Yard(EnvBase):
-    """Worlds in which a camera drives ahead; the action, -1 to 1, is how fast it turns."""
+    """Worlds in which a camera drives ahead; the action, -1 to 1, sets how fast it turns."""
 
     def __init__(self, num_worlds: int = 2) -> None:
         super().__init__(batch_size=[num_worlds])
@@ -72,7 +72,7 @@ class Yard(EnvBase):
 
     def cameras(self) -> Tensor:
         """Returns the cameras' poses [N, 7], positions and quaternions (x, y, z, w)."""
-        # At rest a camera looks down, -z: it is pitched up about x, then turned about z.
+        # Without rotation a camera looks down, along -z. Pitch it up about x, then turn it about z.
         sin_p, cos_p = math.sin(PITCH_RAD / 2), math.cos(PITCH_RAD / 2)
         sin_y, cos_y = (self.yaw / 2).sin(), (self.yaw / 2).cos()
         xyzw = torch.stack([cos_y * sin_p, sin_y * sin_p, sin_y * cos_p, cos_y * cos_p], -1)
@@ -122,7 +122,7 @@ class Yard(EnvBase):
 
 
 def make_env(num_worlds: int = 2) -> TransformedEnv:
-    """Returns the yards as a TorchRL env that writes raw, ego and obj beside Newton's data."""
+    """Returns the yards as a TorchRL env that adds raw, ego and obj to Newton's data."""
     sensors = sensors_from("newton", body_ids=[1, 2], static_ids=[FLOOR])
     return TransformedEnv(Yard(num_worlds), Compose(*sensors, RawFlow(K), FlowFactorize(K)))
 

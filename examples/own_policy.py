@@ -3,10 +3,9 @@
     python -m flowrep.evaluate policy=examples/own_policy.py:make 'representations=[obj,depth]' \
         scene=straight_road
 
-It does not learn. Object flow and depth tell where a moving thing will be by the time that the
-vehicle gets there. If that is in the way, it keeps to the other side of the road, and returns to
-the middle once the way is clear. It infers its own place from its actions, separately for each
-environment.
+The policy does not learn. From object flow and depth it predicts where people will be when the
+vehicle reaches them. If they are in the way, it steers to the other side of the road, and returns to
+the middle once the way is clear. It infers each vehicle's position from its previous actions.
 """
 
 import math
@@ -15,7 +14,7 @@ import torch
 
 GO_ON, LEFT, RIGHT = 0, 1, 2
 STEP_S, SPEED_MPS, TURN_DPS2 = 1 / 12, 10.0, 35.0  # of straight_road at 12 frames a second
-TURN_DPS = TURN_DPS2 * STEP_S  # what an action adds to the yaw rate
+TURN_DPS = TURN_DPS2 * STEP_S  # change of the yaw rate by one action
 RANGE_M = 100.0  # of representations=[depth]
 NEAR_M, IN_THE_WAY_M, EVADE_M = 25.0, 1.5, 2.0
 
@@ -24,13 +23,13 @@ def make(task):
     """Returns a function from maps [N, C, H, W] to actions [N]."""
     K = task.intrinsics.to(task.device)
     column = torch.arange(task.observation_spec["obj"].shape[-1], device=task.device) + 0.5
-    pilots = {}  # by environment
+    pilots = {}  # by env
 
     def act(maps):
         flow, depth_m = maps["obj"], RANGE_M * maps["depth"][:, 0]
-        steps = depth_m / (SPEED_MPS * STEP_S)  # until the vehicle is there
+        steps = depth_m / (SPEED_MPS * STEP_S)  # until the vehicle reaches the point
         right_m = depth_m * (column - K[0, 2] + steps * flow[:, 0]) / K[0, 0]  # at that time
-        near = (flow.norm(dim=1) > 0.05) & (depth_m < NEAR_M)  # and moving, in pixels a step
+        near = (flow.norm(dim=1) > 0.05) & (depth_m < NEAR_M)  # moving, in pixels a step
         in_the_way = near & (right_m.abs() < IN_THE_WAY_M)
         actions = []
         for row, env_id in enumerate(maps["env_id"].tolist()):
@@ -45,14 +44,14 @@ def make(task):
 
 
 class Pilot:
-    """Steers to a distance from the middle of the road, positive to the left."""
+    """Steers to a given distance from the middle of the road, positive to the left."""
 
     def __init__(self):
-        """Begins in the middle, straight ahead."""
+        """Starts in the middle of the road, facing along it."""
         self.rate_dps = self.heading_deg = self.left_m = 0.0
 
     def steer(self, goal_m):
-        """Returns the next action: the goal sets the heading, and that sets the yaw rate."""
+        """Returns the next action: the distance sets a heading, the heading sets a yaw rate."""
         heading_deg = limited(7 * (goal_m - self.left_m), 10)
         rate_dps = limited(5 * (heading_deg - self.heading_deg), 17)
         turn = round(limited((rate_dps - self.rate_dps) / TURN_DPS, 1))

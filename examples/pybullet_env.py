@@ -1,10 +1,10 @@
-"""Ego and object flow in a PyBullet env that others wrote: panda-gym, seen by a camera that orbits.
+"""Ego and object flow in an existing PyBullet env: panda-gym, seen by a camera that orbits.
 
     pip install '.[sim,examples]'
     python examples/pybullet_env.py strip.png
 
-`BulletFlow` adds a camera to any gymnasium env on PyBullet. All that has to be known of the env is
-where it keeps PyBullet's client, and, for a camera that rides on it, the number of the robot.
+`BulletFlow` adds a camera to any gymnasium env on PyBullet. It needs the env's PyBullet client and,
+for a camera that is mounted on the robot, the robot's body number.
 """
 
 import itertools
@@ -24,7 +24,7 @@ HEIGHT, WIDTH, DEG_PER_STEP = 120, 180, 1.5
 
 
 def orbiting(env: Any) -> BulletCamera:
-    """Returns a camera that goes round the table as the episode goes on."""
+    """Returns a camera that moves around the table during the episode."""
     client, yaws_deg = env.sim.physics_client, itertools.count(40, DEG_PER_STEP)
 
     def view() -> list[float]:

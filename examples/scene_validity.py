@@ -1,4 +1,4 @@
-"""Checks that scenes are fair tasks: the planner reaches the ending zone, simple baselines don't.
+"""Checks that scenes are fair tasks: the planner reaches the end zone, simple baselines don't.
 
 python examples/scene_validity.py --scenes straight_road --episodes 500
 """

@@ -1,7 +1,7 @@
 """Draws the effect of sensor noise on object flow in a static scene, where it should be 0.
 
 A camera drives at 10 m/s and 12 frames/s over a plane between two walls. Each picture shows the
-magnitude of object flow under one kind of noise; all have the same scale in pixels.
+length of object flow under one kind of noise; all have the same scale in pixels.
 
 python examples/sensor_noise.py docs/images/sensor_noise.png
 """
@@ -36,7 +36,7 @@ NOISE = {
 
 def main(path: str) -> None:
     sensor = street()
-    raw = ego_flow(sensor["depth"], K, sensor["prev_from_curr"]).flow  # exact: nothing moves
+    raw = ego_flow(sensor["depth"], K, sensor["prev_from_curr"]).flow  # exact, as nothing moves
     figure, axes = plt.subplots(2, 3, figsize=(9.6, 5.4), layout="constrained")
     for axis, (name, options) in zip(axes.flat, NOISE.items()):
         noise = SensorNoise(sensors=["depth", "motion", "flow"], **options)
@@ -56,7 +56,7 @@ def main(path: str) -> None:
 
 
 def street() -> TensorDict:
-    """Returns the depth of a plane, two walls and a house ahead, and a motion of 10/12 m ahead."""
+    """Returns depth of a plane, two walls and a house, and a camera motion of 10/12 m ahead."""
     v, u = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
     x, y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
     plane = torch.where(y > 0, CAMERA_HEIGHT_M / y, torch.inf)

@@ -1,4 +1,4 @@
-"""Writes a sheet of close-ups of all objects and people in a street.
+"""Draws a sheet of close-ups of all kinds of objects and of people in a street.
 
 python examples/shapes.py docs/images/shapes.png
 """

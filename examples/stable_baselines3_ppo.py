@@ -5,7 +5,7 @@
     python -m flowrep.evaluate policy=examples/stable_baselines3_ppo.py:make \
         'representations=[ego,obj]' scene=straight_road
 
-A few thousand steps show that it runs; learning to drive through the street takes about 100,000.
+A few thousand steps suffice to see that it runs; learning to drive takes about 100,000.
 """
 
 import argparse
@@ -15,11 +15,11 @@ import numpy as np
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 
-import flowrep.envs  # noqa: F401 - gymnasium learns the streets' names
+import flowrep.envs  # noqa: F401 - registers the streets with gymnasium
 
 
 def train(steps: int, num_envs: int = 4, rollout_length: int = 128, seed: int = 0) -> PPO:
-    """Returns the trained learner."""
+    """Returns the trained agent."""
     options = {"representations": ["ego", "obj"], "truncate_timeouts": True}
     envs = make_vec_env(
         lambda: gym.make("flowrep/StraightRoad-v0", **options), n_envs=num_envs, seed=seed
@@ -41,7 +41,7 @@ def train(steps: int, num_envs: int = 4, rollout_length: int = 128, seed: int = 
 
 
 def make(task, path: str = "ppo_street"):
-    """Returns the saved learner as a policy for `flowrep.evaluate`."""
+    """Returns the saved agent as a policy for `flowrep.evaluate`."""
     learner = PPO.load(path, device="auto")
 
     def act(maps):

@@ -1,4 +1,4 @@
-"""Ego and object flow of two frames, with pure functions on tensors: no env, no TensorDict.
+"""Ego and object flow of two frames by pure functions on tensors, without env or TensorDict.
 
 A camera drives half a metre ahead while a person in front of it takes a step to the right.
 
@@ -13,14 +13,14 @@ from flowrep.geometry import factorize, instance_motion, intrinsics_from_fov, ri
 def main() -> None:
     K = intrinsics_from_fov(90.0, axis="vertical", height=6, width=8)  # fx = fy = 3 px
 
-    # Poses, camera-to-world, x right, y down, z forward: then and now.
+    # Poses at the previous and the current frame: camera-to-world, x right, y down, z forward.
     world_from_prev_cam, world_from_cam = torch.eye(4), torch.eye(4)
     world_from_cam[2, 3] = 0.5
     world_from_prev_person, world_from_person = torch.eye(4)[None], torch.eye(4)[None]
     world_from_prev_person = world_from_prev_person.clone()
     world_from_prev_person[0, 0, 3] = -1.0
 
-    # The current view: a wall 6 m away, and the person (row 1) in the two middle columns.
+    # The current frame: a wall 6 m away, and the person (instance 1) in the two middle columns.
     depth, instance = torch.full((1, 6, 8), 6.0), torch.zeros(1, 6, 8, dtype=torch.uint8)
     depth[..., 3:5], instance[..., 3:5] = 3.0, 1
 

@@ -51,14 +51,14 @@ def networks(env: TransformedEnv) -> ActorValueOperator:
         common, actor, ValueOperator(nn.Linear(512, 1), in_keys=["hidden"])
     )
     with torch.no_grad():
-        operator(env.reset())  # gives the lazy layers their size
+        operator(env.reset())  # the first call sets the sizes of the lazy layers
     return operator
 
 
 def train(steps: int, num_envs: int = 4, rollout_length: int = 128, seed: int = 0) -> nn.Module:
     """Returns the trained policy."""
     torch.manual_seed(seed)
-    # TorchRL's own transforms go on top: here ego and obj are joined along their channels.
+    # TorchRL's transforms can follow flowrep's: this one joins ego and obj along their channels.
     join = CatTensors(["ego", "obj"], "maps", dim=-3, del_keys=False)
     env = make_env("straight_road", ["ego", "obj"], num_envs=num_envs, seed=seed)
     env = env.append_transform(join)

@@ -3,8 +3,8 @@
     pip install '.[train]'
     python examples/torchrl_trainer.py --frames 100000
 
-Run again with more frames, it continues where it stopped, bit for bit: `StreetCollector` also saves
-the next observation and the state of the env, which TorchRL's collector does not.
+If you run it again with more frames, it continues where it stopped, bit for bit: `StreetCollector`
+also saves the next observation and the state of the env, which TorchRL's collector does not.
 """
 
 import argparse
@@ -42,7 +42,7 @@ class StreetCollector(Collector):
         }
 
     def load_state_dict(self, state_dict: dict[str, Any], **kwargs: Any) -> None:
-        """Continues from a `state_dict`."""
+        """Restores a `state_dict`."""
         super().load_state_dict(state_dict, **kwargs)
         self._traj_pool.load_state_dict(state_dict["traj_pool"])  # TorchRL begins new trajectories
         set_states(self.env, state_dict["streets"])
@@ -67,7 +67,7 @@ def make_trainer(frames: int, num_envs: int, side: int, batch_size: int, seed: i
         network.codecs, capacity=50_000, batch_size=batch_size, device="cpu", n_steps=N_STEPS,
         gamma=GAMMA,
     )  # fmt: skip
-    steps = 10  # of each env between two rounds of updates
+    steps = 10  # frames of each env between two rounds of updates
     trainer = Trainer(
         collector=StreetCollector(
             env, policy, frames_per_batch=steps * num_envs, total_frames=frames

@@ -3,15 +3,15 @@
     pip install '.[examples]'
     python examples/vizdoom_flow.py strip.png
 
-ViZDoom's conventions, which its documentation leaves open, as measured by casting rays through its
-maps; tests/examples/test_vizdoom_flow.py warps frames by this flow:
+ViZDoom's documentation doesn't state its conventions. They were measured by casting rays through
+its maps; tests/examples/test_vizdoom_flow.py checks them by warping frames with the flow:
 
 - 32 map units are a metre, and depth is a byte, linear in z: 7.16 · (byte + 2) units on floors and
   ceilings, which have label 1, and 7.16 · (byte + 1.19) on walls and sprites at 240 rows;
 - the field of view is 90° across the width, and pixels are 1.2 times as wide as tall;
-- labels change from frame to frame; `state.labels` says which object each stands for;
-- sprites are billboards that always face the camera, so a body's pose is its place alone;
-- after the last step there is no state any more.
+- labels change from frame to frame; `state.labels` says which object each label stands for;
+- sprites are billboards that always face the camera, so a body's pose is its position alone;
+- after the last step there is no state.
 """
 
 import os
@@ -42,7 +42,7 @@ CAMERA = ("CAMERA_POSITION_X", "CAMERA_POSITION_Y", "CAMERA_POSITION_Z", "CAMERA
 
 
 class Doom(gym.Env):
-    """A scenario of ViZDoom; the actions are its buttons, one at a time, and none."""
+    """A scenario of ViZDoom; an action presses one of its buttons, or none."""
 
     def __init__(self, scenario: str = "defend_the_line") -> None:
         self.game = vizdoom.DoomGame()
@@ -52,7 +52,7 @@ class Doom(gym.Env):
         self.game.set_screen_format(vizdoom.ScreenFormat.CRCGCB)  # channels first
         for enable in ("depth_buffer", "labels_buffer"):
             getattr(self.game, f"set_{enable}_enabled")(True)
-        # These have no place in depth.
+        # These are not part of depth.
         for hide in ("hud", "weapon", "crosshair", "particles", "decals"):
             getattr(self.game, f"set_render_{hide}")(False)
         variables = [getattr(vizdoom.GameVariable, name) for name in CAMERA]
@@ -116,7 +116,7 @@ class Doom(gym.Env):
 
 
 def copied(observation: dict[str, Any]) -> dict[str, Any]:
-    """Returns a copy, since transforms write beside what an env returns."""
+    """Returns a copy, because transforms write into what an env returns."""
     return observation | {"sensor": dict(observation["sensor"])}
 
 

@@ -1,7 +1,8 @@
 """Object flow of a live ZED camera, or of an SVO file, through Stereolabs' SDK (`pyzed`).
 
-`python examples/zed_live.py live out` factorises until Ctrl-C, `python examples/zed_live.py
-walk.svo2 out` a file. A folder exported from an SVO needs no SDK: `flowrep.factorize format=zed`.
+`python examples/zed_live.py live out` factorises until Ctrl-C, and `python examples/zed_live.py
+walk.svo2 out` factorises a file. A folder that was exported from an SVO needs no SDK:
+`flowrep.factorize format=zed`.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from flowrep.transforms import DIS
 
 
 class ZedLive:
-    """Frames of a ZED as they come, with depth and poses from the SDK (`pyzed`).
+    """Frames of a ZED as they arrive, with depth and poses from the SDK (`pyzed`).
 
     Frames without tracking are left out, and the next frame starts a new clip.
 
