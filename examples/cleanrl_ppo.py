@@ -69,7 +69,7 @@ def update(agent: Agent, optimizer: torch.optim.Optimizer, batch: dict[str, Tens
     for _ in range(EPOCHS):
         for picked in torch.randperm(len(batch["action"])).chunk(MINIBATCHES):
             part = {name: values[picked] for name, values in batch.items()}
-            # The step after the end of an episode only resets the env; gymnasium ignores its action.
+            # The step after an episode's end only resets the env; gymnasium ignores its action.
             counts = 1 - part["ended"]
             policy, value = agent(part["seen"])
             ratio = (policy.log_prob(part["action"]) - part["log_prob"]).exp()

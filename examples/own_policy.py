@@ -4,8 +4,8 @@
         scene=straight_road
 
 The policy does not learn. From object flow and depth it predicts where people will be when the
-vehicle reaches them. If they are in the way, it steers to the other side of the road, and returns to
-the middle once the way is clear. It infers each vehicle's position from its previous actions.
+vehicle reaches them. If they are in the way, it steers to the other side of the road, and returns
+to the middle once the way is clear. It infers each vehicle's position from its previous actions.
 """
 
 import math
