@@ -1,20 +1,21 @@
 """The camera's motion from flow and depth: the robust inverse of ego flow.
 
 With x the ray of pixel p (z = 1), q the inverse of its depth and `prev_from_curr` = (R, T), the
-point that p shows was seen at the projection of R x + q T. The residual is this point minus raw
-flow's p', in pixels. Sky has q = 0 and so constrains the rotation alone, without a case of its own.
+point that p shows was seen at the projection of R x + q T. The residual is this projection minus
+the position p' that raw flow gives, in pixels. Sky has q = 0, so it constrains the rotation alone
+and needs no special case.
 
-Moving bodies are outliers, so the motion is found in three stages:
+Moving bodies are outliers, so the motion is estimated in three stages:
 
-1. Hypotheses: many motions, each from four pixels (RANSAC), scored on some hundred pixels by a
-   truncated cost. The best few are refined and scored again (`_best_hypothesis`).
-2. Some hundred pixels can't tell 49 % from 51 %. The motion of what the best hypothesis leaves
-   unexplained is therefore a candidate too, and all pixels choose between the two.
-3. Gauss-Newton steps on more pixels with Geman-McClure weights, whose scale follows the residuals
-   (`_descended`), and the covariance of the result (`_described`).
+1. Many hypotheses, each computed from four pixels (RANSAC), are scored on a few hundred pixels by
+   a truncated cost. The best few are refined and scored again (`_best_hypothesis`).
+2. A few hundred pixels can't distinguish 49 % from 51 %. A second candidate is therefore the motion
+   of the pixels that the best hypothesis doesn't explain, and all pixels choose between the two.
+3. Gauss-Newton steps on more pixels refine the choice, with Geman-McClure weights whose scale
+   follows the residuals (`_descended`). `_described` computes the covariance of the result.
 
-Pixels are taken in a pseudo-random order, fixed for a size of picture. In a regular order, such as
-every tenth column, a body that fills those columns would win.
+Pixels are used in a pseudo-random order, which is fixed for a picture size. In a regular order,
+such as every tenth column, a body that fills those columns would win.
 
 Shapes: B is the number of frames, N of pixels, M of motions. Values of pixels are `[B, channels,
 N]`, so that the sums over pixels in the normal equations are matrix products.
@@ -34,51 +35,51 @@ from torch.nn import functional
 from flowrep.geometry.checks import check_shape, common_batch
 from flowrep.geometry.closed_form import LARGEST, MIN_DEPTH_RATIO, SMALLEST, known_camera
 
-VOTERS = 1 << 15  # all pixels of smaller pictures; more would change 1 % of votes by chance
-PIXELS = 1536  # used in a Gauss-Newton step; more gain nothing
-SCORED_PIXELS = 320  # that score a hypothesis
-# Four pixels, eight equations for six unknowns. If half of the pixels move with bodies, one draw in
-# 16 has static ones alone: 64 draws miss with a probability of 0.94^64 = 2 %.
+VOTERS = 1 << 15  # pixels in the final choice; a share among so many is right within 1 %
+PIXELS = 1536  # pixels in a Gauss-Newton step; more don't improve the motion
+SCORED_PIXELS = 320  # pixels that score a hypothesis
+# Four pixels are eight equations for six unknowns. If half of the pixels are on moving bodies, one
+# draw in 16 has only static pixels: all 64 draws fail with a probability of 0.94^64 = 2 %.
 HYPOTHESES, PIXELS_EACH = 64, 4
-MIN_PIXELS = 32  # fewer known ones tell no motion: four of them fit any
+MIN_PIXELS = 32  # known pixels below which there is no motion: any motion fits four of them
 _HYPOTHESIS_STEPS, _STEPS = 3, 4  # Gauss-Newton steps of a hypothesis, and of the final motion
 
-# Which of the known pixels a hypothesis is from, as shares of their number. Drawn once, so that the
-# same frame has the same motion in every batch, process and replay.
+# The pixels of each hypothesis, as shares of the number of known pixels. They are drawn only once,
+# so that a frame has the same motion in every batch, process and replay.
 _random = random.Random(0)
 _DRAWS = [[_random.random() for _ in range(PIXELS_EACH)] for _ in range(HYPOTHESES)]
 
-# A pixel's cost in a score is half of its bound at 1.5 standard deviations, and not below 0.02 px:
-# exact flow leaves residuals of rounding alone, by which no two motions can be compared.
+# The residual at which a pixel's cost is half of its bound: 1.5 standard deviations, but at least
+# 0.02 px. The residuals of exact flow are only rounding errors, which can't rank motions.
 _SCORE_SCALES, _LEAST_SCORE_PX = 1.5, 0.02
-_PRIORS_FAVOUR = 1.5  # a body may fill 1.5 times as much as the static world, three fifths
-_REFINED, _REFINING_STEPS = 6, 2  # the best hypotheses, each led to its own optimum
-_RIVAL_STEPS = 3  # of the motion of what the best one leaves unexplained
-_INLIER_SCALES = 2.5  # standard deviations, within which 96 % of normal errors are
-_STILL_PX = 0.2  # standard deviation of flow that counts as a camera's at rest, whatever it shows
-_LEAST_STRENGTH = 0.1  # of a motion's squared flow, in squared deviations from it
-_CHANCES = 16  # times what chance shows, which is 3 / N in that unit: fewer may be noise
-_LEAST_SCALE_PX = 2e-3  # far above float32's rounding of exact flow, far below any measured flow's
-_SCALES = 1.5  # standard deviations at which a pixel's weight is a quarter
-_QUANTILE = 1 / 3  # of all residuals, for their scale: half of the pixels may be outliers
-# That quantile of the length of a vector of two standard normal numbers.
+_PRIORS_FAVOUR = 1.5  # the prior wins against a body on up to 3/5 of the pixels, 1.5 times the rest
+_REFINED, _REFINING_STEPS = 6, 2  # how many of the best hypotheses are refined, in how many steps
+_RIVAL_STEPS = 3  # Gauss-Newton steps of the second candidate
+_INLIER_SCALES = 2.5  # in standard deviations; 96 % of normal errors in two channels are within
+_STILL_PX = 0.2  # flow with residuals up to this standard deviation may be that of a still camera
+_LEAST_STRENGTH = 0.1  # least mean square of a motion's flow, relative to that of the residuals
+_CHANCES = 16  # least multiple of the strength 3 / N that a motion fitted to noise has by chance
+_LEAST_SCALE_PX = 2e-3  # far above the rounding of exact float32 flow, far below any measured flow
+_SCALES = 1.5  # standard deviations at which the weight of a pixel is a quarter
+_QUANTILE = 1 / 3  # of residuals, which gives their scale; half of the pixels may be outliers
+# The same quantile of the length of a vector with two standard normal components.
 _RAYLEIGH = math.sqrt(-2 * math.log(1 - _QUANTILE))
 
 # For flow that is estimated from pictures.
 _WINDOW = 3  # side of the structure tensor's window, pixels
-_GRADIENT_NOISE = 12.0  # grey levels per pixel, of 255, from which a gradient counts as texture
-_LEAST_TEXTURE = 0.25  # of the structure's trace, 0 to 2, below which a pixel isn't known
-_LEAST_EIGENVALUE = 1e-5  # of the scaled normal matrix: less is a direction that nothing tells
+_GRADIENT_NOISE = 12.0  # grey levels (of 255) per pixel above which a gradient counts as texture
+_LEAST_TEXTURE = 0.25  # trace of the structure (0 to 2) below which a pixel's flow is unknown
+_LEAST_EIGENVALUE = 1e-5  # of the scaled normal matrix; below it no pixel determines the direction
 
 
 class MotionEstimate(NamedTuple):
     """The camera's motion `prev_from_curr` `[*B, 4, 4]`, and how well the flow determines it.
 
-    `inlier_share` `[*B]` is the share of the known pixels that move as the camera's motion says,
-    within 2.5 standard deviations of their errors, or 0.2 px if flow is noise. `covariance`
-    `[*B, 6, 6]` is that of (rotation vector in rad, translation in m), a small motion of the
-    previous camera after the estimate; a variance is inf where no pixel determines it. `valid` is
-    bool `[*B]`.
+    `inlier_share` `[*B]` is the share of the known pixels whose flow agrees with the motion, within
+    2.5 standard deviations of the residuals, or within 0.2 px if flow is noise. `covariance`
+    `[*B, 6, 6]` is that of a small motion of the previous camera after the estimate, as (rotation
+    vector in rad, translation in m). A variance is inf if no pixel determines it. `valid` `[*B]` is
+    bool.
     """
 
     prev_from_curr: Tensor
@@ -88,15 +89,15 @@ class MotionEstimate(NamedTuple):
 
 
 class _Samples(NamedTuple):
-    """Pixels of B frames, `[B, N]` each, of which the first `number` are known."""
+    """N pixels of each of B frames; `number` of them are known."""
 
     focal: Tensor  # fx, skew, fy of the previous camera: [B, 3]
-    values: Tensor  # [B, 6 or 9, N]: ray x, y, 1 and q; flow u, v; with a picture xx, xy, yy
-    known: Tensor  # [B, N]
-    number: Tensor  # [B]
+    values: Tensor  # [B, 6 or 9, N]: ray (x, y, 1) and q; flow (u, v); structure (xx, xy, yy)
+    known: Tensor  # [B, N], bool
+    number: Tensor  # [B], of known pixels
 
     def part(self, index: Tensor) -> _Samples:
-        """Returns the pixels at `index` `[B, M, N]` as those of B * M frames."""
+        """Returns the pixels at `index` `[B, M, N]` as samples of B * M frames."""
         at = index.flatten(1)
         values = self.values.gather(-1, at.unsqueeze(1).expand(-1, self.values.shape[1], -1))
         values = values.unflatten(-1, index.shape[1:]).movedim(-2, 1).flatten(0, 1)
@@ -105,12 +106,12 @@ class _Samples(NamedTuple):
         return _Samples(focal, values, known, number)
 
     def every_few(self, count: int, shift: float) -> _Samples:
-        """Returns `count` of each frame's known pixels, spread evenly over all of them."""
+        """Returns `count` known pixels of each frame, evenly spaced in their (random) order."""
         shares = (torch.arange(count, device=self.number.device) + shift) / count
         return self.part((shares * self.number.unsqueeze(-1)).long().unsqueeze(1))
 
     def in_pixels(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns how far a shift of rays at z = 1 is in the picture, `[B, ..., N]`."""
+        """Converts shifts of rays at z = 1, `[B, ..., N]`, to pixels in the picture."""
         fx, skew, fy = self.focal.to(x.dtype).reshape(-1, 3, *[1] * (x.ndim - 1)).unbind(1)
         return fx * x + skew * y, fy * y
 
@@ -133,25 +134,27 @@ def camera_motion(
     The result depends on the frame alone (random draws are fixed) and has no gradient.
 
     Flow estimated on plain surfaces is a guess, or 0. With `picture`, each residual is weighted by
-    the local structure tensor: not at all without texture, and only across an edge.
+    the local structure tensor: it has no weight without texture, and at an edge only its component
+    across the edge counts.
 
-    `valid` is False, and the motion the prior, where fewer than 32 pixels are known, where they
-    leave a direction open (sky alone, for instance, determines only rotation), and where flow is
-    noise: it fits no motion to 0.2 px, and none better than chance allows. Where a K or the prior
-    isn't finite, the motion is the identity.
+    `valid` is False, and the motion is the prior, if fewer than 32 pixels are known, if they don't
+    determine all directions (sky alone, for instance, determines only rotation), or if flow is
+    noise: no motion fits it to 0.2 px, or better than chance allows. If a K or the prior isn't
+    finite, the motion is the identity.
 
-    Two failures don't show in the result. Where more than half of the known pixels move as one
-    body, the motion is relative to that body; a prior helps. And the covariance takes errors for
-    independent: if neighbouring pixels share errors, as estimators' do, it is several times too
-    small, and errors that look like a motion may pass for one.
+    Two failures don't show in the result. If more than half of the known pixels move as one body,
+    the motion is relative to that body; a prior helps. And the covariance assumes independent
+    errors: if neighbouring pixels share errors, as in estimated flow, it is several times too
+    small, and errors that look like a motion may be taken for one.
 
     Args:
-        flow: `[*B, 2, H, W]`, pixels per step, nan where it isn't known.
+        flow: `[*B, 2, H, W]`, pixels per step, nan where it is unknown.
         depth: `[*B, 1, H, W]`, metres along the optical axis.
         K: `[*B, 3, 3]`, pixels.
-        prev_K: K of the previous frame, `[*B, 3, 3]`, if it was another.
+        prev_K: K of the previous frame, `[*B, 3, 3]`, if it was different.
         picture: the current picture `[*B, C, H, W]`, 0 to 255; give it if flow is estimated.
-        prior: the expected motion `[*B, 4, 4]`, the last one or odometry's; identity by default.
+        prior: the expected motion `[*B, 4, 4]`, such as the previous one or odometry; the identity
+            by default.
 
     Raises:
         ValueError: flow, depth and picture differ in size.
@@ -184,7 +187,7 @@ def camera_motion(
         **{name: tensor.shape[: -len(trailing)] for name, (tensor, trailing) in given.items()}
     )
     dtype = torch.promote_types(torch.promote_types(flow.dtype, depth.dtype), torch.float32)
-    if 0 in flow.shape[-2:]:  # a picture without pixels knows as much as one unknown pixel
+    if 0 in flow.shape[-2:]:  # treat a picture without pixels as one unknown pixel
         flow, depth = (x.new_full((*x.shape[:-2], 1, 1), math.nan) for x in (flow, depth))
         picture = None
 
@@ -216,11 +219,11 @@ def camera_motion(
 
 
 def structure_tensor(picture: Tensor) -> Tensor:
-    """Returns how well surroundings determine a shift: xx, xy, yy, `[B, 3, H, W]`.
+    """Returns how well a pixel's surroundings determine its flow: xx, xy, yy, `[B, 3, H, W]`.
 
-    S (S + n I)^-1 for pictures `[B, C, H, W]`, with S the mean of the gradients' products around
-    the pixel and n that of a gradient that is noise. The eigenvalues are 0 without texture and tend
-    to 1 across a contrast.
+    The result is S (S + n I)^-1 for pictures `[B, C, H, W]`. S is the mean of the products of
+    gradients around the pixel, n the square of a gradient that is noise. The eigenvalues are 0
+    without texture, and close to 1 across a strong contrast.
     """
     grey = picture.mean(-3)
     dx, dy = torch.zeros_like(grey), torch.zeros_like(grey)
@@ -238,10 +241,10 @@ def structure_tensor(picture: Tensor) -> Tensor:
 
 @functools.lru_cache(maxsize=16)
 def _shuffled(height: int, width: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Returns the numbers of up to `VOTERS` pixels as if drawn, and their centres `[2, N]`."""
+    """Returns the indices of up to `VOTERS` pixels in random order, and their centres `[2, N]`."""
     bits = (1 << 32) - 1
     key = torch.arange(height * width, device=device)
-    for _ in range(2):  # a hash that is one to one on 32 bits: distinct keys, so a fixed order
+    for _ in range(2):  # a hash that is one to one on 32 bits: keys differ, so the order is fixed
         key = ((key ^ (key >> 16)) * 0x45D9F3B) & bits
     pixel = (key ^ (key >> 16)).argsort()[:VOTERS]
     return pixel, torch.stack([pixel % width, pixel // width]) + 0.5
@@ -255,15 +258,15 @@ def _voters(
     structure: Tensor | None,
     known_frame: Tensor,
 ) -> _Samples:
-    """Returns all pixels of small pictures, `VOTERS` of others, shuffled; none of unknown frames.
+    """Returns up to `VOTERS` pixels of each frame in random order; none of a bad frame is known.
 
-    Their flow is without the part that a change of K causes by itself.
+    The part of their flow that a change of K causes is removed.
     """
     shuffled = _shuffled.__wrapped__ if torch.compiler.is_compiling() else _shuffled
     pixel, centres = shuffled(*flow.shape[-2:], flow.device)
     column, row = centres.to(flow.dtype)
     maps = [flow, depth] if structure is None else [flow, depth, structure]
-    # Gathered, as indexing takes five times as long.
+    # gather, because indexing takes five times as long.
     each = (m.flatten(-2).gather(-1, pixel.expand(*m.shape[:2], -1)) for m in maps)
     values = torch.cat([*each], 1)  # [B, 3 or 6, N]
     u, v, z = values[:, :3].unbind(1)
@@ -274,7 +277,7 @@ def _voters(
     (fx, skew, cx), (_, fy, cy), _ = _entries(K, values.dtype)
     y = (row - cy) / fy
     x = (column - cx - skew * y) / fx
-    # With another K before, a pixel moves although its ray does not; that part is added back.
+    # If the previous K was different, a pixel moves although its ray does not; add that part back.
     (fx, skew, cx), (_, fy, cy), _ = _entries(prev_K - K, values.dtype)
     moved = values[:, :2] + torch.stack([fx * x + skew * y + cx, fy * y + cy], 1)
     ray = torch.stack([x, y, torch.ones_like(x), values[:, 2].reciprocal()], 1)
@@ -284,10 +287,10 @@ def _voters(
 
 
 def _samples(voters: _Samples) -> _Samples:
-    """Returns the first `PIXELS` known ones of the pixels, before unknown ones."""
+    """Returns the first `PIXELS` known pixels of each frame, filled up with unknown ones."""
     batch, looked_at = voters.known.shape
-    # Compaction without a loop or a sort: each known pixel is written to the slot of its rank among
-    # the known ones, all others to a slot beyond the end, which is cut off.
+    # Compact without a loop or a sort: write each known pixel to the slot of its rank among the
+    # known ones, and all others to a slot beyond the end, which is cut off.
     rank = voters.known.long().cumsum(-1) - 1
     slot = torch.where(voters.known & (rank < PIXELS), rank, PIXELS)
     order = torch.zeros(batch, PIXELS + 1, dtype=torch.long, device=slot.device)
@@ -295,7 +298,7 @@ def _samples(voters: _Samples) -> _Samples:
     number = voters.number.clamp(max=PIXELS)
     known = torch.arange(PIXELS, device=slot.device) < number.unsqueeze(-1)
     chosen = voters.part(order[:, None, :PIXELS])
-    values = torch.where(known.unsqueeze(1), chosen.values, 1.0)  # no nan, which weights of 0 keep
+    values = torch.where(known.unsqueeze(1), chosen.values, 1.0)  # nan · 0 would stay nan
     return chosen._replace(values=values, known=known, number=number)
 
 
@@ -309,8 +312,8 @@ def _best_hypothesis(
 ) -> Tensor:
     """Returns the best of the expected motion and the hypotheses from four pixels, `[B, 4, 4]`."""
     batch = len(expected)
-    # All hypotheses of all frames at once, as B * H frames of four pixels, in float64: four pixels
-    # in a row make normal equations that are nearly singular.
+    # All H hypotheses of all frames at once, as B * H frames of four pixels. In float64, because
+    # the normal equations of four pixels in a row are nearly singular.
     draws = torch.tensor(_DRAWS, dtype=torch.float64, device=expected.device)
     drawn = samples.part((draws * samples.number[:, None, None]).long())  # [B, H, 4]
     each = _Samples(drawn.focal, drawn.values.double(), drawn.known, drawn.number)
@@ -318,8 +321,8 @@ def _best_hypothesis(
     for _ in range(_HYPOTHESIS_STEPS):
         at = _linearised(each, motion)
         normal, right = _normal_equations(each, at, at.in_front.double())
-        # Damped, relative to each parameter's own size and to the largest, so that a direction that
-        # four pixels don't tell leaves the motion where it is.
+        # Damped relative to each diagonal element and to the largest one, so that the motion
+        # doesn't change in a direction that the four pixels don't determine.
         diagonal = normal.diagonal(dim1=-2, dim2=-1)
         damping = 1e-9 * diagonal + 1e-12 * diagonal.amax(-1, keepdim=True) + 1e-30
         step = torch.linalg.solve_ex(normal + torch.diag_embed(damping), right)[0]
@@ -328,10 +331,11 @@ def _best_hypothesis(
     scored, others = (samples.every_few(SCORED_PIXELS, shift) for shift in (0.0, 0.5))
     first = _descended(scored, expected, _STEPS) if has_prior else expected
     motions = torch.cat([first.unsqueeze(1), motion.unflatten(0, (batch, HYPOTHESES))], 1)
-    # Factors on the scores: the expected motion wins exact ties, a prior also what is nearly one.
+    # Factors on the (negative) costs: the expected motion wins exact ties, a prior also near ties.
     favour = torch.ones(1 + HYPOTHESES, device=expected.device)
     favour[0] = _PRIORS_FAVOUR if has_prior else 1 + 1e-6
-    # Neighbouring hypotheses lead to different optima: the best ones are refined and scored again.
+    # Similar costs may lead to different optima, so the best hypotheses are refined and scored
+    # again.
     best = (_costs(scored, motions)[0] * favour).topk(_REFINED, largest=False).indices
     motions = motions.gather(1, best[..., None, None].expand(-1, -1, 4, 4)).flatten(0, 1)
     repeated = _Samples(*(part.repeat_interleave(_REFINED, 0) for part in scored))
@@ -339,8 +343,8 @@ def _best_hypothesis(
     costs, scale = _costs(scored, motions, final=True)
     choice = (costs * favour[best]).argmin(-1, keepdim=True)
     motion = motions.gather(1, choice[..., None, None].expand(-1, -1, 4, 4)).squeeze(1)
-    # What it leaves unexplained may be the world, of which the few pixels showed too little. Looked
-    # for among other pixels than those that chose the motion.
+    # The pixels that it doesn't explain may be the static world, which happened to have too few of
+    # the scored pixels. The second candidate therefore comes from other pixels.
     ru, rv, in_front, *_ = _residuals(others, motion)
     is_rest = _squared(others, ru, rv) > (_INLIER_SCALES * scale).square().unsqueeze(-1)
     unexplained = others._replace(known=others.known & in_front & is_rest)
@@ -353,19 +357,20 @@ def _best_hypothesis(
 
 
 def _costs(samples: _Samples, motions: Tensor, *, final: bool = False) -> tuple[Tensor, Tensor]:
-    """Returns truncated costs a pixel, -1 to 0, of motions `[B, M, 4, 4]`, `[B, M]`, and the scale.
+    """Returns costs per pixel `[B, M]`, -1 to 0, of motions `[B, M, 4, 4]`, and the scale `[B]`.
 
-    A final choice is among motions at their optima. A compromise between two bodies' motions, which
-    explains both by half, must not win over the motion of one; squaring sees to that.
+    The final choice is between optimised motions. A compromise between the motions of two bodies,
+    which explains both by half, must not win against the motion of one; squaring prevents that.
     """
     ru, rv, in_front, *_ = _residuals(samples, motions)
     known = in_front & samples.known.unsqueeze(1)
     squared = torch.where(known, _squared(samples, ru, rv), torch.inf)
     number = samples.known.sum(-1, keepdim=True)
-    # Truncated at a few standard deviations of the residuals of the motion that fits best.
+    # The scale is that of the residuals of the motion that fits best.
     scale = _scale(squared, number).amin(-1) * (1.0 if final else _SCORE_SCALES)
     scale = scale.clamp(min=_LEAST_SCORE_PX)
-    # What a pixel is explained by, from 1 for no residual to 0: Geman-McClure's 1 - r² / (s² + r²).
+    # Geman-McClure's 1 - r² / (s² + r²): 1 if a pixel has no residual, and 0 if it is not
+    # explained.
     kept = (1 + squared / scale.square()[:, None, None]).reciprocal()
     return -(kept.square() if final else kept).sum(-1) / number.clamp(min=1), scale
 
@@ -373,11 +378,13 @@ def _costs(samples: _Samples, motions: Tensor, *, final: bool = False) -> tuple[
 def _residuals(samples: _Samples, motion: Tensor) -> tuple[Tensor, ...]:
     """Returns residuals in px, whether points were in front of the camera, and how they moved.
 
-    `motion` is `[B, 4, 4]`, or `[B, M, 4, 4]` for M motions of each frame; the results are
-    `[B, (M,) N]`: u, v, in front, the shift of x / z and of y / z, and z now over z then.
+    `motion` is `[B, 4, 4]`, or `[B, M, 4, 4]` for M motions of each frame. The results are
+    `[B, (M,) N]`: residuals u and v, in front, the shifts of x / z and y / z, and the ratio of the
+    current z to the previous z.
     """
     ray = samples.values[:, :4]
-    # As in `closed_form`, the difference from no motion: exactly 0 for none, and rounded finer.
+    # The motion minus the identity, as in `closed_form`: shifts are exactly 0 without motion, and
+    # rounding errors are smaller.
     still = torch.eye(3, 4, dtype=motion.dtype, device=motion.device)
     moved = (motion[..., :3, :] - still).to(ray.dtype)
     moved = (moved.flatten(1, -2) @ ray).unflatten(1, moved.shape[1:-1])  # [B, (M,) 3, N]
@@ -393,7 +400,7 @@ def _residuals(samples: _Samples, motion: Tensor) -> tuple[Tensor, ...]:
 
 
 def _squared(samples: _Samples, ru: Tensor, rv: Tensor) -> Tensor:
-    """Returns the squared lengths of residuals, weighted by the pixels' structure."""
+    """Returns the squared lengths of residuals, weighted by the structure (r^T S r)."""
     structure = samples.values[:, 6:].unbind(1)
     if not structure:
         return ru * ru + rv * rv
@@ -402,27 +409,27 @@ def _squared(samples: _Samples, ru: Tensor, rv: Tensor) -> Tensor:
 
 
 def _scale(squared: Tensor, number: Tensor) -> Tensor:
-    """Returns a robust standard deviation of residuals per channel, px, from `[..., N]` squares."""
-    every = max(4, squared.shape[-1] // 384)  # some 384 tell a quantile well enough, and sort fast
-    squared = squared[..., ::every]  # unknown ones are inf and come last
+    """Returns a robust standard deviation per channel, px, from squared residuals `[..., N]`."""
+    every = max(4, squared.shape[-1] // 384)  # 384 values give a good quantile and are sorted fast
+    squared = squared[..., ::every]  # unknown ones are inf, so they are sorted to the end
     rank = (number * (_QUANTILE / every)).long().unsqueeze(-1).expand(*squared.shape[:-1], 1)
     return squared.sort(-1).values.gather(-1, rank).squeeze(-1).sqrt() / _RAYLEIGH
 
 
 class _Linear(NamedTuple):
-    """A motion's residuals `[B, N]`, px, and their change by a small motion after it."""
+    """The residuals of a motion `[B, N]`, px, and their derivatives by a small motion after it."""
 
     ru: Tensor
     rv: Tensor
     in_front: Tensor
-    Ju: Tensor  # by rotation vector and translation, [B, 6, N]
+    Ju: Tensor  # [B, 6, N], by rotation vector and translation
     Jv: Tensor
 
 
 def _linearised(samples: _Samples, motion: Tensor) -> _Linear:
-    # A small rotation w and shift t after the motion move a point P = (n, m, 1) / q, now in the
-    # previous camera, by w × P + t. The rows are the derivatives of n = x / z and m = y / z, first
-    # by the three angles, then by the three shifts.
+    # In the previous camera's coordinates, a small rotation w and translation t after the motion
+    # shift the point P = (n, m, 1) / q by w × P + t. The rows are the derivatives of n = x / z and
+    # m = y / z by the three components of w, then by those of t.
     ru, rv, in_front, dn, dm, per_z = _residuals(samples, motion)
     n, m = samples.values[:, 0] + dn, samples.values[:, 1] + dm
     q = samples.values[:, 3] * per_z
@@ -433,7 +440,7 @@ def _linearised(samples: _Samples, motion: Tensor) -> _Linear:
 
 
 def _normal_equations(samples: _Samples, at: _Linear, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns J^T W J `[B, 6, 6]` and J^T W r `[B, 6]`, float64."""
+    """Returns J^T W J `[B, 6, 6]` and J^T W r `[B, 6]`, float64, for weights `[B, N]`."""
     weight, structure = weight.unsqueeze(1), samples.values[:, 6:]
     if structure.shape[1] == 0:
         Wu, Wv = weight * at.Ju, weight * at.Jv
@@ -448,7 +455,8 @@ def _normal_equations(samples: _Samples, at: _Linear, weight: Tensor) -> tuple[T
 def _after(motion: Tensor, step: Tensor) -> Tensor:
     """Returns the motion followed by a small one, (rotation vector, translation) `[..., 6]`."""
     turn, shift = step.unsqueeze(-1).split([3, 3], -2)
-    # Rodrigues, as in `rotation_from_vector`, whose matrix would cost half of a step for one frame.
+    # Rodrigues' formula, as in `rotation_from_vector`. Building its matrix would take half of the
+    # time of a step for a single frame.
     turns = turn.norm(dim=-2, keepdim=True) / math.pi
     rows = motion[..., :3, :]
     crossed = torch.linalg.cross(turn, rows, dim=-2)
@@ -459,23 +467,24 @@ def _after(motion: Tensor, step: Tensor) -> Tensor:
 
 
 class _Weighted(NamedTuple):
-    """A motion's residuals, their Geman-McClure weights, and what the pixels determine.
+    """A motion's residuals, their Geman-McClure weights, and the directions that pixels determine.
 
-    A parameter's unit moves the pixels by one pixel in all (root of the sum of squares), so that
-    radians and metres compare; 0 for a parameter that moves none. Eigenvalues and vectors are those
-    of the normal matrix in these units. Where the structure hides a motion, its value is near 0.
+    To make radians and metres comparable, each parameter has a unit: a change by one unit moves all
+    pixels together by one pixel (root of the sum of squares). A parameter that moves no pixel has
+    the unit 0. Eigenvalues and eigenvectors are those of the normal matrix in these units. The
+    eigenvalue of a motion that the structure hides is near 0.
     """
 
     at: _Linear
-    squared: Tensor
-    scale: Tensor  # a few standard deviations, px, [B]
-    ratio: Tensor  # squared over the scale's square
-    weight: Tensor
-    right: Tensor  # J^T W r, [B, 6]
-    unit: Tensor  # of the six parameters, [B, 6]
-    values: Tensor
-    vectors: Tensor
-    seen: Tensor  # which directions count
+    squared: Tensor  # [B, N], px²
+    scale: Tensor  # [B], px, `_SCALES` standard deviations
+    ratio: Tensor  # [B, N], squared / scale²
+    weight: Tensor  # [B, N]
+    right: Tensor  # [B, 6], J^T W r
+    unit: Tensor  # [B, 6]
+    values: Tensor  # [B, 6], ascending
+    vectors: Tensor  # [B, 6, 6], in columns
+    seen: Tensor  # [B, 6], bool: whether pixels determine the direction of an eigenvector
 
 
 def _weighted(samples: _Samples, motion: Tensor) -> _Weighted:
@@ -499,7 +508,7 @@ def _descended(samples: _Samples, motion: Tensor, steps: int) -> Tensor:
     """Returns the motion after Gauss-Newton steps, in the directions that pixels determine."""
     for _ in range(steps):
         now = _weighted(samples, motion)
-        # The step in the eigenbasis: a direction that no pixel tells keeps its value, where a
+        # Take the step in the eigenbasis and only in the determined directions. In the others, a
         # solver would divide by nearly 0.
         along = (now.vectors.mT @ (now.unit * now.right).unsqueeze(-1)).squeeze(-1)
         along = torch.where(now.seen, along / now.values, 0.0)
@@ -508,11 +517,11 @@ def _descended(samples: _Samples, motion: Tensor, steps: int) -> Tensor:
 
 
 def _described(samples: _Samples, motion: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns a motion's inlier share, its covariance and whether pixels determine all of it."""
+    """Returns a motion's inlier share `[B]`, covariance `[B, 6, 6]` and validity `[B]`."""
     now = _weighted(samples, motion)
-    # An M-estimator's covariance is the sandwich A^-1 B A^-1: A is the derivative of its equations,
-    # B the covariance of their noise. A is the normal matrix times the mean slope of w(r^2) r,
-    # which is w (1 - 2 ratio / (1 + ratio)), averaged over the directions of r.
+    # The covariance of an M-estimator is the sandwich A^-1 B A^-1. A is the derivative of its
+    # equations: the normal matrix times the mean slope of w(r^2) r, which, averaged over the
+    # directions of r, is w (1 - 2 ratio / (1 + ratio)). B is the covariance of the noise in them.
     weight, ratio, seen = now.weight, now.ratio, now.seen
     slope = torch.where(weight > 0, weight * (1 - 2 * ratio / (1 + ratio)), 0.0).sum(-1)
     slope = (slope / weight.sum(-1).clamp(min=1e-12)).clamp(min=0.1).double()
@@ -521,10 +530,10 @@ def _described(samples: _Samples, motion: Tensor) -> tuple[Tensor, Tensor, Tenso
     scaled = now.unit[..., None] * now.vectors * torch.where(seen, now.values.rsqrt(), 0.0)[:, None]
     inverse = scaled @ scaled.mT
     covariance = inverse @ middle @ inverse / slope.square()[:, None, None]
-    # A parameter that has a part in a direction which no pixel tells is not known at all.
+    # A parameter with a component in an undetermined direction is not determined at all.
     is_open = (now.vectors.square() * ~seen.unsqueeze(-2)).sum(-1) > 1e-6  # [B, 6]
     covariance = torch.where(is_open.unsqueeze(-1) | is_open.unsqueeze(-2), 0.0, covariance)
-    variance = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0)  # of exact flow, rounding
+    variance = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0)  # rounding may make it negative
     variance = torch.where(is_open, torch.inf, variance)
     diagonal = torch.eye(6, dtype=torch.bool, device=motion.device)
     covariance = torch.where(diagonal, variance.unsqueeze(-1), covariance)
@@ -536,11 +545,12 @@ def _described(samples: _Samples, motion: Tensor) -> tuple[Tensor, Tensor, Tenso
 
 
 def _is_motion(samples: _Samples, now: _Weighted) -> Tensor:
-    """Returns whether flow is more than noise: the camera rests, or its motion shows in the flow.
+    """Returns whether the flow isn't just noise `[B]`: the camera rests, or its motion is visible.
 
-    Noise has a best-fitting motion too, whose squared flow is by chance 6 / 2 N of the noise's, for
-    N pixels and six parameters, and some more as it is the best of many. Noise up to `_STILL_PX`
-    can't be distinguished from a camera at rest.
+    A motion can be fitted to noise, too. By chance, the mean square of its flow is 6 / 2N of that
+    of the noise, for six parameters and N pixels with two channels, and somewhat more because it is
+    the best of many hypotheses. Noise up to `_STILL_PX` can't be distinguished from a camera at
+    rest.
     """
     ego = _squared(samples, samples.values[:, 4] - now.at.ru, samples.values[:, 5] - now.at.rv)
     ego = (now.weight * ego).sum(-1) / now.weight.sum(-1).clamp(min=1e-12)
