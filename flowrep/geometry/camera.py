@@ -1,4 +1,4 @@
-"""The pinhole camera: points to pixels and back, and its intrinsics K from other conventions."""
+"""The pinhole camera: projection, its inverse, and the intrinsics K from other conventions."""
 
 from __future__ import annotations
 
@@ -151,12 +151,12 @@ def intrinsics_from_opencv(K_opencv: Tensor) -> Tensor:
 def check_intrinsics(
     name: str, K: Tensor, size: tuple[int, int] | None = None, *, allow_unknown: bool = False
 ) -> None:
-    """Checks that every K `[*B, 3, 3]` is a camera's, with pictures of `size` (height, width).
+    """Checks that every K `[*B, 3, 3]` can be a camera's, with pictures of `size` (height, width).
 
-    The bounds on a K for a size are wide: a focal length of 0.2 to 20 times the longer side, that
-    is, fields of view of 136 to 3 degrees, and a principal point a tenth of the picture from its
-    border or more. Lenses are centred to a few per cent, and a crop may lose four ninths of the
-    picture on one side. K of a picture of twice the size has its principal point at the border.
+    The bounds for a size are wide: a focal length of 0.2 to 20 times the longer side, that is,
+    fields of view of 136 to 3 degrees, and a principal point at least a tenth of the picture inside
+    its border. Real lenses are centred to a few per cent, and a crop may cut off four ninths of the
+    picture on one side. The K of a picture of twice the size has its principal point at the border.
 
     The check waits for a GPU.
 
@@ -166,16 +166,16 @@ def check_intrinsics(
             mark its frame invalid.
 
     Raises:
-        ValueError: the first K that has other rows than (fx, skew, cx), (0, fy, cy), (0, 0, 1),
-            nan, inf, or a focal length that is not positive, or that no camera has whose picture is
-            of that size.
+        ValueError: names the first K whose rows are not (fx, skew, cx), (0, fy, cy), (0, 0, 1),
+            that has nan, inf or a focal length that is not positive, or that can't belong to a
+            picture of that size.
 
     >>> check_intrinsics("K", torch.tensor([[4.0, 0.0, 0.0], [0.0, 8.0, 0.0], [1.5, 2.5, 1.0]]))
     Traceback (most recent call last):
     ValueError: K should have the rows (fx, skew, cx), (0, fy, cy), (0, 0, 1) in pixels, ...
     >>> check_intrinsics("K", torch.tensor([[60.0, 0, 80], [0, 60, 60], [0, 0, 1]]), (60, 80))
     Traceback (most recent call last):
-    ValueError: K is of no camera whose picture is 80 wide and 60 high: ...
+    ValueError: K can't belong to a picture 80 px wide and 60 px high: ...
     """
     check_shape(name, K, (3, 3))
     fixed = K.new_tensor([0.0, 0.0, 0.0, 1.0])
@@ -200,7 +200,7 @@ def check_intrinsics(
     if bool(wrong.any()):
         where, index = first_wrong(name, wrong)
         raise ValueError(
-            f"{where} is of no camera whose picture is {width} wide and {height} high: fx and fy "
+            f"{where} can't belong to a picture {width} px wide and {height} px high: fx and fy "
             f"should be {SHORTEST * side:g} to {LONGEST * side:g} px, cx "
             f"{BORDER * width:g} to {(1 - BORDER) * width:g}, cy {BORDER * height:g} to "
             f"{(1 - BORDER) * height:g}; got {K[index].tolist()}. If it is of a picture of another "

@@ -1,4 +1,4 @@
-"""Checks of arguments. Those of shapes and dtypes are static: compiled code doesn't run them."""
+"""Checks of arguments. Compiled code skips those of shapes and dtypes, which are static."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def over_points(name: str, matrix: Tensor, points_name: str, points: Tensor) -> 
 
 
 def first_wrong(name: str, wrong: Tensor) -> tuple[str, tuple[int, ...]]:
-    """Returns the name and the index of the first item of a batch that is wrong."""
+    """Returns the name and the index of the first wrong item of a batch."""
     index = wrong.nonzero()[0].tolist()
     return (f"{name}[{', '.join(map(str, index))}]" if index else name), tuple(index)
 
@@ -74,7 +74,7 @@ def check_name(option: str, name: object, names: Any) -> None:
 
 
 def check_rows(lowest: int, highest: int, rows: int) -> None:
-    """Raises RuntimeError if ids from `lowest` to `highest` are no rows of `rows` motions."""
+    """Raises RuntimeError if some id from `lowest` to `highest` has no row among `rows` motions."""
     if lowest < 0 or highest >= rows:
         raise RuntimeError(
             f"instance holds ids {lowest} to {highest}, but prev_from_curr_by_instance has {rows} "

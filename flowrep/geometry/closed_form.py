@@ -10,15 +10,15 @@ relative to c. If the previous frame had other intrinsics K_p, with M those rela
 
     A = (M (R - I) + K_p - K) K'^-1,    e = M T
 
-so that with q = A x~ + e / Z the flow p - p' is (x~ qz - qx, y~ qz - qy) / (1 + qz). No two large
-numbers are subtracted: the float32 result is an order of magnitude closer to float64 than p - p'
-computed with the homography K R K^-1, and without motion flow is exactly 0.
+so that with q = A x~ + e / Z the flow p - p' is (x~ qz - qx, y~ qz - qy) / (1 + qz). This never
+subtracts two large numbers. The float32 result is therefore ten times as accurate as p - p' from
+the homography K R K^-1, and without motion flow is exactly 0.
 
-1 + qz is the point's depth in the previous camera over that in the current one. Flow grows without
-bound as it falls to 0, so a pixel counts as seen before only if it is above `MIN_DEPTH_RATIO`.
+1 + qz is the point's depth in the previous camera divided by that in the current one. As this ratio
+falls to 0, flow grows without bound, so flow is valid only if the ratio is above `MIN_DEPTH_RATIO`.
 
-Valid flow is finite, without a check per pixel: the bounds below exclude inputs for which an
-intermediate result could overflow in float32, which ends at 3e38 (the worst case reaches 3e34).
+Valid flow is finite, and no pixel has to be checked for that: the bounds below exclude inputs for
+which an intermediate result could overflow in float32 (the worst case is 3e34, the limit 3e38).
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-# Lower bound on the depth in the previous camera over the depth in the current one.
+# Lower bound on the depth in the previous camera divided by the depth in the current one.
 MIN_DEPTH_RATIO = 0.01
 
-# Bounds on what is accepted, far beyond any camera's: within them nothing overflows in float32.
+# Bounds on valid input, far beyond any camera's values. Within them nothing overflows in float32.
 LARGEST = 1e8  # of the entries of K, A and e: pixels, metres and their products
 SMALLEST = 1e-8  # of depth in metres, and of dt
 
@@ -41,7 +41,7 @@ Planes = tuple[Tensor, Tensor, Tensor]  # u, v, valid: [*B, H, W] each
 def known_camera(K: Tensor, dt: float | Tensor) -> tuple[Tensor, float | Tensor, Tensor]:
     """Returns K and dt with invalid values replaced, and where they were valid, `[*B]`.
 
-    They are replaced, not only masked, to keep nan out of gradients.
+    A mask alone would not keep nan out of gradients.
     """
     known = _within_bounds(K, (-2, -1)) & (K[..., 0, 0] != 0) & (K[..., 1, 1] != 0)
     K = torch.where(known[..., None, None], K, torch.eye(3, dtype=K.dtype, device=K.device))
@@ -62,11 +62,11 @@ def motion_coefficients(
 ) -> Tensor:
     """Returns A (row by row) and e, `[*B, 12]`; without `prev_K` the previous K is the same.
 
-    Where an input isn't known, they place every point behind the previous camera, so that no pixel
-    is valid, without a check per pixel.
+    If an input is unknown, the coefficients place every point behind the previous camera. No pixel
+    is then valid, and pixels need no separate check.
 
     The products are written out because a batched matrix product may round differently from a
-    single one, and a static body would then not have exactly the camera's flow.
+    single one, and a static body's flow would then differ from the camera's.
     """
     bounded = _within_bounds(prev_from_curr, (-2, -1))
     motion = torch.where(bounded[..., None, None], prev_from_curr, 0.0)
@@ -89,8 +89,9 @@ def motion_coefficients(
     coefficients = torch.stack(torch.broadcast_tensors(*a, *e), -1)
     known = (known & bounded & _within_bounds(coefficients, (-1,))).unsqueeze(-1)
     behind = (0.0, -2.0, 0.0)  # 1 + qz = -1
-    # Concatenated, so that inductor stores the twelve numbers. A single `where` it would fuse with
-    # what reads them, and repeat at every pixel: 1.4 to 1.7 times the time of `factorize`.
+    # Concatenated, so that inductor stores the twelve numbers. It would fuse a single `where` with
+    # the code that reads them and repeat it at every pixel, and `factorize` would take 1.4 to 1.7
+    # times as long.
     parts = zip(coefficients.split([8, 1, 3], -1), behind)
     return torch.cat([torch.where(known, part, otherwise) for part, otherwise in parts], -1)
 
@@ -115,14 +116,14 @@ def flow_planes(
     """
     depth = depth.to(x.dtype)
     has_depth = depth >= SMALLEST  # nan compares False
-    # The result is masked in any case. Gradients need the inputs of both divisions masked as well:
-    # the derivative of an unused branch is 0 · inf = nan. Eager code without gradients saves these
-    # two passes; compiled code, which takes any input, fuses them.
+    # The result is masked in any case. For gradients, the inputs of both divisions must be masked
+    # as well, because the derivative of an unused branch is 0 · inf = nan. Eager code without
+    # gradients skips these two passes. Compiled code must accept any input, and fuses them.
     has_gradient = any(tensor.requires_grad for tensor in (depth, x, y, *q_far, *e))
     is_masked = has_gradient or torch.compiler.is_compiling()
     inverse_depth = (torch.where(has_depth, depth, 1.0) if is_masked else depth).reciprocal()
     qx, qy, qz = (far + near * inverse_depth for far, near in zip(q_far, e))
-    z_ratio = 1.0 + qz  # depth in the previous camera over depth in the current one
+    z_ratio = 1.0 + qz  # depth in the previous camera divided by depth in the current one
     in_front = has_depth & (z_ratio > MIN_DEPTH_RATIO)
     per_z = (torch.where(in_front, z_ratio, 1.0) if is_masked else z_ratio).reciprocal()
     if isinstance(dt, Tensor) or dt != 1.0:
@@ -130,7 +131,7 @@ def flow_planes(
     u = ((x * qz - qx) * per_z).to(dtype)
     v = ((y * qz - qy) * per_z).to(dtype)
     valid = in_front
-    # Computed in float32 or float64 but returned as float16, which ends at 65,504.
+    # Computed in float32 or float64, but perhaps returned as float16, whose limit is 65,504.
     if torch.finfo(dtype).max < torch.finfo(x.dtype).max:
         valid = valid & u.isfinite() & v.isfinite()
     return torch.where(valid, u, 0.0), torch.where(valid, v, 0.0), valid
@@ -139,8 +140,8 @@ def flow_planes(
 def stack_planes(u: Tensor, v: Tensor) -> Tensor:
     """Returns `[*B, 2, H, W]` from `[*B, H, W]` planes.
 
-    Concatenated along the rows and split. torch.stack makes inductor interleave the channels, which
-    takes 5 to 20 % longer.
+    It concatenates the planes along the rows and splits the result. With torch.stack, inductor
+    interleaves the channels, which takes 5 to 20 % longer.
     """
     return torch.cat([u, v], -2).unflatten(-2, (2, -1))
 
@@ -148,9 +149,9 @@ def stack_planes(u: Tensor, v: Tensor) -> Tensor:
 def mask_channel(valid: Tensor) -> Tensor:
     """Returns bool `[*B, 1, H, W]` from a `[*B, H, W]` plane.
 
-    When compiled, the mask is written as bytes and then viewed as bool, as inductor's CPU code
-    stores bools one lane at a time: `factorize` would take 5 to 10 times as long (torch 2.13).
-    as_strided, which changes nothing, makes inductor write the bytes before the view.
+    Inductor's CPU code stores bools one lane at a time, and `factorize` would take 5 to 10 times as
+    long (torch 2.13). When compiled, the mask is therefore written as bytes and viewed as bool.
+    as_strided changes nothing, but makes inductor write the bytes before the view.
     """
     if torch.compiler.is_compiling():
         ones = torch.where(valid, 1.0, 0.0).to(torch.uint8)

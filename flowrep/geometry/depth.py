@@ -13,8 +13,8 @@ from flowrep.geometry.checks import check_name, check_shape, common_batch
 
 DepthKind: TypeAlias = Literal["z", "ray_length", "z_buffer", "reversed_z_buffer"]
 
-# How far a depth buffer may be from 1 where nothing is drawn: PyBullet's software renderer composes
-# it of float32 products and is off by up to three times the spacing of numbers below 1.
+# How far a depth buffer may be from 1 where nothing is drawn. The float32 products in PyBullet's
+# software renderer are off by up to three times the spacing of numbers below 1.
 _ROUNDING = 3 * 2.0**-24
 
 
@@ -46,10 +46,10 @@ def adapt_depth(
         far_m: the far plane, `math.inf` if the projection has none; only for the two buffers.
         scale_m: metres per unit of `depth`, 1 if it is float; whole numbers, such as uint16
             millimetres (0.001), need it. Not for the two buffers.
-        nothing: a value, before scaling, that means no measurement; it becomes nan.
-        sky: a value, before scaling, that means no surface; it becomes inf. A positive one is a far
-            plane, and whatever is beyond 0.999 of it becomes inf too; otherwise whatever is below.
-            Not for the two buffers.
+        nothing: a value, before scaling, that means missing depth; it becomes nan.
+        sky: a value, before scaling, that means no surface; it becomes inf. A positive value is a
+            far plane, and depth beyond 0.999 of it becomes inf, too. Otherwise, depth below the
+            value becomes inf, too. Not for the two buffers.
 
     Raises:
         ValueError: an argument that `kind` needs is missing, or one that it doesn't read is given.
@@ -63,7 +63,7 @@ def adapt_depth(
     is_sky = None if sky is None else _is_sky(depth, sky)
     unmeasured = None if nothing is None else depth == nothing
     if scale_m is not None:
-        # Divided, since 1 / 0.001 is exact and 0.001 isn't: 3,000 mm become 3 m, not 3.0000002.
+        # Divided, because 1 / 0.001 is exact and 0.001 isn't: 3,000 mm become 3 m, not 3.0000002.
         depth = (depth if depth.is_floating_point() else depth.float()) / (1.0 / scale_m)
     if unmeasured is not None:
         depth = torch.where(unmeasured, torch.nan, depth)
@@ -79,8 +79,8 @@ def adapt_depth(
 
 
 def _is_sky(depth: Tensor, sky: float) -> Tensor:
-    """Returns where depth is the simulator's value for no surface, or on the sky's side of it."""
-    # A far plane comes out of a float32 buffer up to a thousandth off.
+    """Returns where depth is the simulator's value for no surface, or beyond it."""
+    # Depth at the far plane, computed from a float32 buffer, is off by up to a thousandth.
     return depth >= 0.999 * sky if sky > 0 else depth <= sky
 
 

@@ -19,7 +19,7 @@ Direction: TypeAlias = Literal["forward", "backward"]
 Grid: TypeAlias = Literal["current", "previous"]
 Channels: TypeAlias = Literal["uv", "row_column"]
 
-SMALL = 1 << 14  # pixels up to which PyTorch is as fast, and numba need not be loaded
+SMALL = 1 << 14  # pixels up to which PyTorch is as fast as numba, which then isn't loaded
 
 
 class Flow(NamedTuple):
@@ -33,7 +33,7 @@ class Flow(NamedTuple):
 
 
 class Factors(NamedTuple):
-    """Raw flow split into the camera's and the objects' share, `[*B, 2, H, W]` each.
+    """Raw flow split into ego flow and object flow, `[*B, 2, H, W]` each.
 
     `valid` is bool `[*B, 1, H, W]`; where it is False, `obj` is 0 and `raw = ego + obj` need not
     hold.
@@ -58,10 +58,10 @@ def ego_flow(
     v down, pixels. If the camera drives forward, flow points outwards. At depth inf, only rotation
     causes flow.
 
-    Flow is invalid, and 0, where depth is nan or <= 0, and where the point's depth in the previous
-    camera was less than a hundredth of its current depth, or negative (there, flow grows without
-    bound). A whole frame is invalid if its K, its motion or its entry of a tensor `dt` isn't
-    finite, `dt` isn't positive, or an entry is beyond 1e8. Valid flow is finite.
+    Flow is 0 and invalid where depth is nan or <= 0, and where the point's depth in the previous
+    camera was negative or less than a hundredth of its current depth (there, flow grows without
+    bound). A whole frame is invalid if its K, its motion or its `dt` isn't finite or has an entry
+    beyond 1e8, or if `dt` isn't positive. Valid flow is finite.
 
     Equations 7 to 11 of the paper. Floats narrower than float32 are computed in float32.
 
@@ -70,7 +70,7 @@ def ego_flow(
         K: `[*B, 3, 3]`, rows (fx, skew, cx), (0, fy, cy), (0, 0, 1), pixels.
         prev_from_curr: `[*B, 4, 4]`, rigid, metres; takes a point in the current camera's frame
             into the previous camera's.
-        prev_K: K of the previous frame, `[*B, 3, 3]`, if it was another (zoom, autofocus).
+        prev_K: K of the previous frame, `[*B, 3, 3]`, if it was different (zoom, autofocus).
         dt: time between the frames, a number or `[*B]`; 1 gives px/step, seconds give px/s.
 
     Raises:
@@ -102,8 +102,8 @@ def rigid_flow(
     Convention: as in `ego_flow`, with one motion for each instance. Row i of
     `prev_from_curr_by_instance` takes a point fixed to instance i from the current camera's frame
     into the previous camera's, at the previous frame; row 0 is the static world's. Where a pixel's
-    row equals `prev_from_curr`, the result is bitwise equal to that of `ego_flow`. A row that isn't
-    known (nan) makes only the pixels of its instance invalid.
+    row equals `prev_from_curr`, the result is bitwise equal to that of `ego_flow`. An unknown row
+    (nan) makes only the pixels of its instance invalid.
 
     Equation 1 of the paper.
 
@@ -150,9 +150,8 @@ def factorize(
     Equation 6 of the paper.
 
     Args:
-        raw: `[*B, 2, H, W]`, pixels per dt, nan where it isn't known; or the `Flow` of
-            `rigid_flow`, with its mask. (Its flow alone is 0 where it isn't known, which would
-            count as measured.)
+        raw: `[*B, 2, H, W]`, pixels per dt, nan where it is unknown; or the `Flow` of `rigid_flow`
+            with its mask. (Without the mask, the 0 of unknown pixels would count as measured.)
         depth: see `ego_flow`, as for `K`, `prev_from_curr` and `prev_K`.
         dt: see `ego_flow`; the unit of `raw` must agree.
 
@@ -166,11 +165,11 @@ def factorize(
     (tensor([-0.5000, -0.5000]), tensor([0.0000, 3.5000]))
     """
     if isinstance(raw, Flow):
-        # Viewed as bytes, as inductor's CPU code fails to compile a `where` on a bool view.
+        # Viewed as bytes, because inductor's CPU code can't compile a `where` on a bool view.
         raw = torch.where(raw.valid.view(torch.uint8) != 0, raw.flow, math.nan)
     check_shape("raw", raw, (2, "H", "W"))
     batch = _check(depth, K, prev_K, prev_from_curr, dt, raw=raw)
-    # Ego flow is rounded regardless of raw's dtype, so that static pixels have exactly 0 obj.
+    # Ego flow is rounded as in `rigid_flow`, whatever raw's dtype, so that static obj is exactly 0.
     u, v, valid = _planes(batch, depth, None, K, prev_K, prev_from_curr.unsqueeze(-3), dt)
     dtype = torch.promote_types(u.dtype, raw.dtype)
     compute = torch.promote_types(u.dtype, torch.float32)
@@ -189,8 +188,8 @@ def factorize(
     if torch.finfo(dtype).max < torch.finfo(compute).max:
         measured = measured & obj_u.isfinite() & obj_v.isfinite()
     known = valid & measured
-    # When compiled, two masks in turn: inductor would spill their conjunction to memory, as bools
-    # one lane at a time, and take ten times as long.
+    # When compiled, apply the two masks in turn. Inductor would write their conjunction to memory,
+    # as bools one lane at a time, and take ten times as long.
     masks = [measured, valid] if torch.compiler.is_compiling() else [known]
     for mask in masks:
         obj_u, obj_v = torch.where(mask, obj_u, 0.0), torch.where(mask, obj_v, 0.0)
@@ -218,7 +217,7 @@ def adapt_flow(
         ValueError: the grid is the previous frame's. Its pixels have moved, several of them to the
             same pixel and none to others, so flow on the current grid would be a guess.
 
-    >>> flow = torch.tensor([3.0, -2.0]).reshape(2, 1, 1)  # 3 rows up, 2 columns right it was
+    >>> flow = torch.tensor([3.0, -2.0]).reshape(2, 1, 1)  # it was 3 rows down, 2 columns left
     >>> adapt_flow(flow, direction="backward", grid="current", channels="row_column").flatten()
     tensor([ 2., -3.])
     """
@@ -286,7 +285,7 @@ def _planes(
     motions: Tensor,
     dt: float | Tensor,
 ) -> Planes:
-    """Returns the flow planes of one motion for each instance, `[*B, N, 4, 4]`.
+    """Returns the flow planes for one motion per instance, `[*B, N, 4, 4]`.
 
     Without ids, all pixels have the first motion.
     """
@@ -315,9 +314,9 @@ def _planes(
     else:
         each = _of_pixels(by_motion, instance)
     axx, axy, ax, ayx, ayy, ay, azx, azy, az, *e = each
-    # q at infinity is A x~, which is affine in x and y: a term per column plus one per row.
+    # q at infinity is A x~, which is affine in x and y: one term per column plus one per row.
     columns, rows = [axx * x, ayx * x, azx * x], [axy * y + ax, ayy * y + ay, azy * y + az]
-    if instance is None:  # then each term has W or H values, not H · W
+    if instance is None:  # each term has W or H values instead of H · W
         x, *columns = _table(x, *columns)
         y, *rows = _table(y, *rows)
     q_far = [column + row for column, row in zip(columns, rows)]
@@ -342,15 +341,16 @@ def _of_pixels(by_motion: Tensor, instance: Tensor) -> list[Tensor]:
 def _table(*entries: Tensor) -> tuple[Tensor, ...]:
     """Returns the entries as slices of one tensor.
 
-    Stacked, as inductor stores what is stacked. It would recompute the entries at every pixel,
-    which takes 1.7 times as long.
+    Inductor stores stacked entries. Otherwise it would compute them again at every pixel, which
+    takes 1.7 times as long.
     """
     return torch.stack(torch.broadcast_tensors(*entries)).unbind()
 
 
 def _suits_numba(depth: Tensor, *others: float | Tensor) -> bool:
     """Returns whether `numba_flow` can and should compute: large float32 batches, CPU, no grad."""
-    # First: a branch on sizes would make compiled code recompile for others.
+    # This comes first, because a branch on sizes would make compiled code recompile for other
+    # sizes.
     if torch.compiler.is_compiling():
         return False
     tensors = [depth, *(other for other in others if isinstance(other, Tensor))]

@@ -1,9 +1,9 @@
 """Flow of large maps on a CPU in a single pass over the pixels; importing this needs numba.
 
-PyTorch needs some twenty passes for `closed_form.flow_planes`, each through memory: 11.3 ms for a
-step of 96 environments at 84 × 84, where these kernels take 3.7. They do the same operations in the
-same order, each rounded to float32, so that the results are bitwise equal. Change one only together
-with the other. `flow` decides which maps are computed here.
+PyTorch needs about twenty passes through memory for `closed_form.flow_planes`: 11.3 ms for a step
+of 96 envs at 84 × 84, where these kernels take 3.7 ms. They do the same operations in the same
+order, each rounded to float32, so that the results are bitwise equal. If you change one, change the
+other. `flow` decides which maps are computed here.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ _LEAST_DEPTH, _LEAST_RATIO = np.float32(SMALLEST), np.float32(MIN_DEPTH_RATIO)
 _LARGEST_RAW = np.float32(largest_raw(torch.float32))
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 
-# "numpy": a division by 0 is inf, as in PyTorch, without the branch that would raise. No fastmath,
-# as it may fuse or reorder operations, and the last bits would differ from PyTorch's.
+# "numpy": a division by 0 gives inf, as in PyTorch, without a branch that raises. No fastmath: it
+# may fuse or reorder operations, and the last bits would differ from PyTorch's.
 _compiled = compiled(error_model="numpy")
 
 
@@ -39,13 +39,13 @@ def planes_of_motions(
 ) -> Planes:
     """Returns the flow planes of N motions per map, whose coefficients are A and e `[*B, N, 12]`.
 
-    Depth and the number of each pixel's motion, None if all have motion 0, are `[*B, H, W]`; x
-    `[*B, 1, W]` and y `[*B, H, 1]` are `centred_pixels`, dt is a number or `[*B]`.
+    Depth and the index of each pixel's motion (None if all have motion 0) are `[*B, H, W]`; x
+    `[*B, 1, W]` and y `[*B, H, 1]` are `centred_pixels`; dt is a number or `[*B]`.
     """
     *batch, height, width = depth.shape
     maps, motions = math.prod(batch), coefficients.shape[-2]
 
-    # Any batch becomes one of `maps` maps: all broadcast, flattened, without a copy if possible.
+    # Broadcast all to one batch and flatten it to `maps` maps, without a copy if possible.
     def array(tensor: Tensor, *sizes: int) -> Any:
         rows = tensor.detach().expand((*batch, *sizes)).reshape((maps, *sizes))
         return rows.contiguous().numpy()
@@ -72,7 +72,7 @@ def planes_of_motions(
 
 
 def object_flow(raw: Tensor, u: Tensor, v: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns raw − ego, 0 where it isn't known, `[*B, 2, H, W]`, and where it is, `[*B, H, W]`.
+    """Returns raw − ego `[*B, 2, H, W]`, 0 where it is unknown, and where it is known `[*B, H, W]`.
 
     Raw flow is `[*B, 2, H, W]`, float32; ego flow's u, v and bool valid are `[*B, H, W]`.
     """
@@ -113,7 +113,7 @@ def _fill(depth, ids, coefficients, xs, ys, dts, u, v, valid):
     lowest, highest = np.int64(0), np.int64(0)
     maps, height, width = depth.shape
     motions = coefficients.shape[1]
-    # First every pixel with its frame's motion 0, that of the static world ...
+    # First compute every pixel with motion 0 of its frame, that of the static world ...
     for n in range(maps):
         c = coefficients[n, 0]
         near = (c[9], c[10], c[11])
@@ -126,8 +126,8 @@ def _fill(depth, ids, coefficients, xs, ys, dts, u, v, valid):
                 u[n, i, j], v[n, i, j], valid[n, i, j] = _flow(
                     depth[n, i, j], x, y, far, near, dts[n]
                 )
-    # ... then again those of moving bodies, which are few. In one loop, the branch on the id would
-    # keep the compiler from computing many pixels at once.
+    # ... then compute those of moving bodies, which are few, again. In a single loop, the branch on
+    # the id would keep the compiler from computing many pixels at once.
     for n in range(len(ids)):
         for i in range(height):
             y = ys[n, i]

@@ -24,7 +24,7 @@ POSE_SHAPES: dict[str, tuple[int, ...]] = {
     "xyz_yaw": (4,), "xyz_yaw_pitch": (5,),
 }  # fmt: skip
 
-# OpenCV's right, down and forward as (axis, sign) of the other convention.
+# OpenCV's right, down and forward, each as (axis, sign) in the other convention.
 _OPENCV_AXES = {
     "opencv": ((0, 1), (1, 1), (2, 1)),
     "opengl": ((0, 1), (1, -1), (2, -1)),  # x right, y up, z backward
@@ -33,14 +33,14 @@ _OPENCV_AXES = {
     "unreal": ((1, 1), (2, -1), (0, 1)),  # x forward, y right, z up
     "unity": ((0, 1), (1, -1), (2, 1)),  # x right, y up, z forward
 }
-# The last two are left-handed: their worlds become right-handed by the opposite of this axis.
+# The last two are left-handed; reversing this world axis makes their worlds right-handed.
 _OPPOSITE_WORLD_AXIS = {"unreal": 1, "unity": 2}
 
 
 def invert_rigid(a_from_b: Tensor) -> Tensor:
     """Returns `b_from_a`, the inverse of a rotation and translation, `[*B, 4, 4]` each.
 
-    Convention: (Rᵀ, -Rᵀt) for (R, t); a matrix with scale or shear has another inverse.
+    Convention: the inverse of (R, t) is (Rᵀ, -Rᵀt); this is wrong for matrices with scale or shear.
 
     >>> a_from_b = torch.eye(4)
     >>> a_from_b[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
@@ -123,8 +123,9 @@ def instance_motion(
             f"and {world_from_curr_body.shape[-3]}"
         )
     camera = relative_motion(world_from_prev, world_from_curr, dtype=dtype).unsqueeze(-3)
-    # The point moves with the body: prev ← body at that time = body now ← curr. Both factors are
-    # relative motions, so that large world coordinates cancel in each.
+    # A point of the body has the same body coordinates at both frames, so the motion is
+    # prev_from_prev_body · curr_body_from_curr. Both factors are relative motions, in which large
+    # world coordinates cancel.
     prev_body_from_prev = relative_motion(
         world_from_prev_body, world_from_prev.unsqueeze(-3), dtype=torch.float64
     )
@@ -159,7 +160,7 @@ def instance_rows(ids: Tensor, body_ids: Tensor) -> Tensor:
     dtype = torch.uint8 if count < 256 else torch.int32
     if count == 0:
         return torch.zeros_like(ids, dtype=dtype)
-    # A binary search and not a table, as ids may be as large as a packed colour.
+    # A binary search instead of a table, because ids may be as large as a packed colour.
     ascending, order = body_ids.long().sort()
     ids = ids.long()
     nearest = torch.searchsorted(ascending, ids.contiguous()).clamp(max=count - 1)
@@ -177,8 +178,8 @@ def check_rigid(name: str, a_from_b: Tensor, *, tolerance: float = 1e-3) -> None
         tolerance: on each element of R Rᵀ - I and of the last row.
 
     Raises:
-        ValueError: the first transform that has nan or inf, a last row other than (0, 0, 0, 1),
-            scale or shear, or a left-handed frame.
+        ValueError: names the first transform that has nan or inf, a last row other than
+            (0, 0, 0, 1), scale or shear, or is left-handed.
 
     >>> check_rigid("pose", torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0])))
     Traceback (most recent call last):
@@ -204,7 +205,7 @@ def check_rigid(name: str, a_from_b: Tensor, *, tolerance: float = 1e-3) -> None
 
 
 def transform_points(a_from_b: Tensor, points_b: Tensor) -> Tensor:
-    """Returns points `[*B, ..., 3]` in frame a, in the wider of the two float types.
+    """Returns points `[*B, ..., 3]` in frame a, in the wider of the arguments' two float types.
 
     Args:
         a_from_b: `[*B, 4, 4]`; its batch dims are the leading dims of `points_b`.
@@ -225,7 +226,7 @@ def transform_points(a_from_b: Tensor, points_b: Tensor) -> Tensor:
 
 def rotation_from_vector(vector: Tensor) -> Tensor:
     """Returns the rotation matrix `[*B, 3, 3]` of a rotation vector `[*B, 3]`, rad."""
-    # As exact as torch.linalg.matrix_exp of the cross product's matrix, in a fraction of the time.
+    # As accurate as torch.linalg.matrix_exp of the cross-product matrix, in a fraction of the time.
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
@@ -251,18 +252,18 @@ def adapt_pose(
     `"x_forward_z_up"` x forward, y left, z up. The world's axes stay as they are, since they cancel
     in every relative motion.
 
-    Two are left-handed, camera and world alike: `"unreal"` (also CARLA) x forward, y right, z up;
-    `"unity"` x right, y up, z forward. Their worlds become right-handed: unreal's y points left,
-    unity's z backward. Convert poses of bodies with the same axes then.
+    In two conventions, both camera and world are left-handed: `"unreal"` (also CARLA) x forward,
+    y right, z up; `"unity"` x right, y up, z forward. Their worlds become right-handed: unreal's y
+    then points left, unity's z backward. Give poses of bodies the same axes.
 
     Args:
-        pose: `[*B, 4, 4]`, or what `layout` says.
-        layout: `"matrix"`; `"matrix_3x4"`, without the last row; `"xyz_xyzw"` or `"xyz_wxyz"`,
-            `[*B, 7]`, translation and unit quaternion, its real part last or first; `"xyz_yaw"` or
-            `"xyz_yaw_pitch"`, `[*B, 4]` or `[*B, 5]`, translation and angles in radians in a world
-            whose z is up: yaw from the world's x to its y, pitch upwards. The camera then looks
-            along its x axis (`axes="x_forward_z_up"` or `"unreal"`).
-        direction: `"camera_to_world"` takes points from the camera's frame into the world's;
+        pose: in the shape of its `layout`.
+        layout: `"matrix"` `[*B, 4, 4]`; `"matrix_3x4"`, without the last row; `"xyz_xyzw"` or
+            `"xyz_wxyz"` `[*B, 7]`, translation and unit quaternion, with the real part last or
+            first; `"xyz_yaw"` `[*B, 4]` or `"xyz_yaw_pitch"` `[*B, 5]`, translation and angles in
+            radians, in a world whose z is up: yaw from the world's x to its y, pitch upwards. With
+            angles, the camera looks along its x axis (`axes="x_forward_z_up"` or `"unreal"`).
+        direction: `"camera_to_world"` transforms points from camera to world coordinates;
             `"world_to_camera"` (extrinsics) is the inverse.
         axes: see above.
         check: whether to check that poses are rigid, which waits for a GPU.
@@ -288,8 +289,8 @@ def adapt_pose(
         check_rigid("pose", matrix)
     if direction == "world_to_camera":
         matrix = invert_rigid(matrix)
-    # Each column is one of the given columns or its opposite. Picked, since a matrix product would
-    # round, and its constant would be copied to a GPU in every call.
+    # Each column is one of the given columns or its opposite. A matrix product would round, and its
+    # constant would be copied to a GPU in every call.
     columns = [sign * matrix[..., axis : axis + 1] for axis, sign in _OPENCV_AXES[axes]]
     matrix = torch.cat([*columns, matrix[..., 3:]], -1)
     if (opposite := _OPPOSITE_WORLD_AXIS.get(axes)) is None:
@@ -336,8 +337,8 @@ def pose_from_quaternion(pose: Tensor, layout: PoseLayout, *, check: bool = True
     Args:
         pose: `[*B, 7]`, x, y, z in metres, then the quaternion.
         layout: `"xyz_xyzw"` or `"xyz_wxyz"`.
-        check: whether a quaternion whose length is off 1 by 0.001 raises ValueError, which waits
-            for a GPU. Quaternions are normalised in either case.
+        check: whether a quaternion whose length differs from 1 by 0.001 raises ValueError; this
+            waits for a GPU. Quaternions are normalised in either case.
 
     Raises:
         ValueError: with `check`, a quaternion's length is not 1.
