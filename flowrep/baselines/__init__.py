@@ -18,12 +18,12 @@ Baseline = Callable[[StreetEnv], int]
 
 
 def never_turn(env: StreetEnv) -> int:
-    """Returns NO_OP: drives straight on."""
+    """Returns NO_OP, so that the vehicle drives straight on."""
     return NO_OP
 
 
 class RandomActions:
-    """Draws actions uniformly, seeded by `seed` and the episode's own seed."""
+    """Draws actions uniformly, with a generator for each `seed` and episode seed."""
 
     def __init__(self, seed: int = 0) -> None:
         self._seed = seed
@@ -38,7 +38,7 @@ class RandomActions:
 
 BASELINES: dict[str, Callable[[], Baseline]] = {
     "planner": Planner,
-    # wide margins first, as people are not where it expects them
+    # It tries wide margins first, because people won't be where it expects them.
     "speed_blind": lambda: Planner((100,), (1.0, 0.5, 0.1), sees_speed=False),
     "never_turn": lambda: never_turn,
     "random": RandomActions,
@@ -46,9 +46,9 @@ BASELINES: dict[str, Callable[[], Baseline]] = {
 
 
 class BaselinePolicy:
-    """Lets a baseline choose the actions of an env's streets, as a policy of `evaluate`.
+    """A baseline as a policy for `evaluate`, which chooses the actions of an env's streets.
 
-    It needs no observation: an env without representations renders nothing.
+    It needs no observation, and an env without representations renders nothing.
 
     Args:
         name: one of `BASELINES`.
@@ -60,7 +60,7 @@ class BaselinePolicy:
         self._baselines = [BASELINES[name]() for _ in self._streets]
 
     def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes `action` for the streets that `env_id` names."""
+        """Writes `action` for the streets in `env_id`."""
         ids = tensordict["env_id"].tolist()
         actions = [self._baselines[i](self._streets[i]) for i in ids]
         return tensordict.set("action", torch.tensor(actions, device=tensordict.device))

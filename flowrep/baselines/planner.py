@@ -1,8 +1,8 @@
 """A privileged baseline that knows every pose, present and future, and searches ahead.
 
-It is no agent but an upper bound for a scene: a beam search that simulates the rest of the episode
-up to the ending zone and keeps only drives without a collision. Blind to speed, it is a reference:
-an agent that does better at speeds far from the normal ones must read people's speed.
+It is an upper bound for a scene: a beam search simulates the rest of the episode up to the end zone
+and keeps only drives without a collision. Without knowledge of speeds it is a reference: an agent
+that does better at speeds far from the normal ones must read people's speed.
 """
 
 import heapq
@@ -26,18 +26,21 @@ from flowrep.scenes.vehicle import NO_OP, YAW_SIGN, VehicleState, footprint_corn
 
 Array = NDArray[Any]
 _ACTIONS = np.array([0, 1, 2])
-_HOLD_STEPS = 2  # steps that each decision of the search holds for
+_HOLD_STEPS = 2  # each decision of the search holds for two steps, which halves the search's depth
 _MARGIN_M = 0.1  # distance kept from the road's edge, and from people whose speed is known
-# States in the same cell are interchangeable: x, y in metres, yaw and yaw rate in degrees. Only the
-# best of a cell is kept, so that a beam holds different drives and not variants of one.
+# Size of a cell of states: x, y in metres, yaw in degrees, yaw rate in degrees a second. Only the
+# best state of a cell is kept, so that the beam holds different drives and not variants of one.
 _CELL = np.array([0.5, 0.5, 4.0, 6.0])
-# A state's cost is the way to the ending zone from two points ahead of it, at half of this distance
-# and at all of it, so that a vehicle which faces the right way is ahead of one which does not.
+# The cost of a state is the distance to the end zone from two points ahead of the vehicle, at half
+# of this distance and at all of it. A vehicle that faces the right way therefore costs less.
 _LOOK_AHEAD_M = 6.0
-_TURNING_M_PER_DPS = 0.02  # added to the cost: of two equal ways the straighter one wins
-# The most that a way counts. Off the road it is inf, to which turning would add nothing.
+# Added to the cost per degree a second, so that of two ways of equal length the straighter one
+# wins. It is small: the largest yaw rate, 60 degrees a second, counts as much as 1.2 m.
+_TURNING_M_PER_DPS = 0.02
+# Cost of a point off the road, larger than any distance in a scene. Its distance is inf, and costs
+# of inf would not differ by the yaw rate.
 _OFF_ROAD_M = 1e6
-_GRID_M = 0.5  # cells of the distances to the ending zone
+_GRID_M = 0.5  # side of a cell of `GoalDistance`
 _NEIGHBOURS = [(i, j, math.hypot(i, j)) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
 
 
@@ -48,8 +51,8 @@ class Planner:
         beams: beam widths; a wider beam is tried if no drive of a narrower one reaches the ending
             zone.
         margins_m: distances to keep from people, in the order in which they are tried.
-        sees_speed: whether it knows how fast people walk. If not, it sees where everyone is and
-            heads to, takes all who walk for the mean of the scene's normal speeds, and plans again
+        sees_speed: whether it knows how fast people walk. If not, it knows everyone's position and
+            heading, assumes the mean of the scene's normal speeds for all who walk, and plans again
             after each decision.
     """
 
@@ -78,7 +81,7 @@ class Planner:
         return action
 
     def search(self, episode: Episode) -> list[int]:
-        """Returns the actions of a drive to the ending zone, or of the longest drive found."""
+        """Returns the actions of a drive to the end zone, or of the longest drive found."""
         crowd = episode.crowd
         if not self.sees_speed:
             normal = sum(episode.layout.scene.pedestrian_speed_mps["normal"]) / 2
@@ -93,7 +96,7 @@ class Planner:
 
 
 class GoalDistance:
-    """A grid of shortest distances from the free ground to the ending zone."""
+    """A grid with the length of the shortest way from each point of the free ground to the goal."""
 
     def __init__(self, free: shapely.Geometry, goal: shapely.Geometry) -> None:
         x0, y0, x1, y1 = free.bounds
@@ -102,12 +105,13 @@ class GoalDistance:
         x = x0 + (np.arange(columns) + 0.5) * _GRID_M
         y = y0 + (np.arange(rows) + 0.5) * _GRID_M
         grid = np.meshgrid(x, y, indexing="ij")
-        # A margin of cells at infinity represents everything outside the grid.
+        # The outermost cells have an infinite distance and stand for everything outside the grid.
         is_open = np.pad(shapely.contains_xy(free, *grid), 1)
         is_goal = is_open & np.pad(shapely.contains_xy(goal, *grid), 1)
         self._way = np.where(is_goal, 0.0, np.inf)
-        # Dijkstra's algorithm, outwards from all cells of the ending zone at once. scipy's would
-        # need as many lines to build the graph, and nothing else in the simulation needs scipy.
+        # Dijkstra's algorithm, from all cells of the end zone at once. With scipy's version, it
+        # would take as many lines to build the graph, and nothing else in the simulation needs
+        # scipy.
         queue = [(0.0, i, j) for i, j in np.argwhere(is_goal).tolist()]
         while queue:
             way, i, j = heapq.heappop(queue)
@@ -120,13 +124,13 @@ class GoalDistance:
                     heapq.heappush(queue, (longer, i + di, j + dj))
 
     def __call__(self, x_m: Array, y_m: Array) -> Array:
-        """Returns the distances to the ending zone in metres, inf off the free ground."""
+        """Returns the distances to the end zone in metres, inf off the free ground."""
         cell = np.floor((np.stack([x_m, y_m], -1) - self._origin) / _GRID_M).astype(np.int64) + 1
         cell = np.clip(cell, 0, np.array(self._way.shape) - 1)
         return self._way[cell[..., 0], cell[..., 1]]
 
 
-@lru_cache(maxsize=16)  # takes a second, and all planners of a scene share it
+@lru_cache(maxsize=16)  # it takes a second, and all planners of a scene share it
 def _ground(layout: Layout, path: Path) -> tuple[shapely.Geometry, GoalDistance]:
     free = free_ground(layout, path)
     return free, GoalDistance(free, layout.zones[path.end])
@@ -145,7 +149,7 @@ class _Search:
         episode = self.episode
         state = VehicleState(*(np.array([value]) for value in episode.now.vehicle))
         steps, ticks = episode.steps, episode.now.ticks
-        history = np.empty((1, 0), dtype=np.int64)  # the decisions that led to each state
+        history = np.empty((1, 0), dtype=np.int64)  # [V, D], the decisions that led to each state
         while steps < episode.limit_steps:
             parents = np.repeat(np.arange(state.x_m.size), len(_ACTIONS))
             actions = np.tile(_ACTIONS, state.x_m.size)
@@ -164,7 +168,7 @@ class _Search:
     def drive(
         self, state: VehicleState, actions: Array, ticks: int, margin_m: float
     ) -> tuple[VehicleState, Array, Array]:
-        """Returns the states after one decision, which of them are unharmed and which arrived."""
+        """Returns the states [V] after one decision, and which are unharmed and which arrived."""
         alive, arrived = np.ones(actions.size, dtype=bool), np.zeros(actions.size, dtype=bool)
         signs = np.array(YAW_SIGN)[actions]
         for _ in range(_HOLD_STEPS):
@@ -180,7 +184,7 @@ class _Search:
         return state, alive, arrived
 
     def best(self, state: VehicleState, alive: Array, most: int) -> Array:
-        """Returns the indices of the most promising states, one for each cell."""
+        """Returns the indices of up to `most` states with the least cost, one per cell."""
         index = np.flatnonzero(alive)
         x, y, yaw, rate = (value[index] for value in state)
         ahead = [_LOOK_AHEAD_M * share for share in (0.5, 1.0)]
@@ -194,7 +198,7 @@ class _Search:
 
     def _touches(self, state: VehicleState, ticks: int, margin_m: float) -> Array:
         people = self.crowd.positions(ticks * self.episode.tick_s)
-        # Only people within reach of the box around all vehicles of the beam.
+        # Leave out people who are out of reach of all vehicles.
         reach = self.vehicle.length_m + self.vehicle.width_m
         low = np.array([state.x_m.min(), state.y_m.min()]) - reach
         high = np.array([state.x_m.max(), state.y_m.max()]) + reach

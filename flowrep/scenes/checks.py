@@ -1,6 +1,6 @@
 """Checks of a scene as a whole: its parts agree, paths are open, people keep apart.
 
-Pydantic has checked each part by then.
+They run after pydantic has checked each part.
 """
 
 from collections.abc import Iterable, Iterator
@@ -22,14 +22,14 @@ from flowrep.scenes.scene import (
     SceneError,
 )
 
-_LEAST_END_M = 1.0  # length of an ending zone; the vehicle is checked at least every 0.42 m
+_LEAST_END_M = 1.0  # length of an end zone; the vehicle's position is tested at least every 0.42 m
 
 
 def check_references(scene: Scene) -> None:
-    """Checks that all names exist, and that distances along roads are on these roads."""
+    """Checks that all names exist, and that distances along a road don't exceed its length."""
     most = 255 // len(pedestrians.PARTS)  # instance ids have 8 bits, and 0 is the static world
     if scene.num_pedestrians > most:
-        raise SceneError(f"pedestrian_groups: {scene.num_pedestrians} people; keep to {most}")
+        raise SceneError(f"pedestrian_groups: {scene.num_pedestrians} people; give {most} or fewer")
     _check_known("categories", scene.categories, CATEGORY_ID)
     for key, names in _categories_used(scene).items():
         _check_known(key, names, scene.categories)
@@ -86,7 +86,7 @@ def _check_known(key: str, names: Iterable[str], known: Iterable[str]) -> None:
 
 
 def check_path(layout: Layout, path: Path) -> None:
-    """Checks that a path begins on free road and leads to its ending zone."""
+    """Checks that a path starts on free road and leads to its end zone."""
     key = f"paths.{path.name}"
     footprint, end = layout.start_footprint(path.start), layout.zones[path.end]
     blocks = [box.footprint for box in layout.boxes(path)]
@@ -95,10 +95,10 @@ def check_path(layout: Layout, path: Path) -> None:
     if shapely.intersects(footprint, blocks).any():
         raise SceneError(f"{key}: its start collides; move the start or what is in it")
     if shapely.intersects(end, blocks).any():
-        raise SceneError(f"{key}: its ending zone is built over; move what is in it")
+        raise SceneError(f"{key}: its end zone is built over; move what is in it")
     start, vehicle = shapely.Point(layout.start_state(path.start)[:2]), layout.scene.vehicle
     if end.intersects(start):
-        raise SceneError(f"{key}: starts inside its ending zone {path.end!r}; move one of them")
+        raise SceneError(f"{key}: starts inside its end zone {path.end!r}; move one of them")
     # One connected piece of ground, wide enough for the vehicle's narrower side, must hold both
     # the start and the end.
     room = free_ground(layout, path).buffer(-min(vehicle.width_m, vehicle.length_m) / 2)
@@ -110,7 +110,7 @@ def check_path(layout: Layout, path: Path) -> None:
 
 
 def check_walks(layout: Layout) -> None:
-    """Checks that no episode can put a person into a box, another person or the vehicle."""
+    """Checks that people never overlap a box, another person or the start of the vehicle."""
     reach, least = pedestrians.RADIUS_M, pedestrians.APART_M
     grounds = {group.name: _ground(layout, group) for group in layout.scene.pedestrian_groups}
     boxes = [*layout.buildings, *layout.obstacles, *layout.closures.values()]
@@ -149,7 +149,7 @@ def _ground(layout: Layout, group: PedestrianGroup) -> list[shapely.Geometry]:
     line = layout.walk_line(group.walk)
     if len(line) < 2:
         raise SceneError(f"{key}.walk: has no length; give two points apart from each other")
-    # Only a walk of a single person may cross itself: two people could meet where lanes cross.
+    # Only the walk of a single person may cross itself; where lanes cross, two people could meet.
     is_walkable = all(pedestrians.keeps_its_stretches(line, side * spread / 2) for side in (-1, 1))
     if not is_walkable or (group.count > 1 and not pedestrians.keeps_lanes_apart(line, spread)):
         raise SceneError(

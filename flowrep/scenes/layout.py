@@ -1,4 +1,4 @@
-"""A scene laid out on the ground: polygons, boxes and walking lines, computed once from its data.
+"""The ground plan of a scene: polygons, boxes and walking lines, computed once from its data.
 
 Convention: world metres, x forward at yaw 0, yaw counter-clockwise. Distances along a road start at
 its beginning; negative ones, and those beyond its end, are on its straight continuation.
@@ -32,8 +32,8 @@ from flowrep.scenes.vehicle import VehicleState, footprint_corners
 
 Array = NDArray[np.float64]
 _ARC_STEP_DEG = 5.0
-_TOUCH_M = 0.05  # by which houses may overlap, as those of a row stand wall to wall
-_PLOT_STEP_M = 0.5  # by which a house advances until there is room for it
+_TOUCH_M = 0.05  # houses may overlap by this much, because those of a row stand wall to wall
+_PLOT_STEP_M = 0.5  # step in which a house is moved along the road until there is room for it
 SHORTEST_M = 1e-3  # shorter stretches of a walk are left out: they have no heading
 
 
@@ -45,7 +45,7 @@ def centreline(road: Road) -> shapely.LineString:
         arc_deg = piece.arc_deg or 0.0
         count = max(1, math.ceil(abs(arc_deg) / _ARC_STEP_DEG))
         turn = math.radians(arc_deg) / count
-        # Chords between points on the arc, each along the heading in the middle of its piece.
+        # The arc is sampled by chords; each has the heading in the middle of its part of the arc.
         chord = 2 * (piece.arc_radius_m or 0.0) * math.sin(abs(turn) / 2)
         length = piece.straight_m or chord
         for _ in range(count):
@@ -63,7 +63,7 @@ def stretch(line: shapely.LineString, from_m: float, to_m: float) -> shapely.Lin
 
 
 def distinct_points(points: Array) -> Array:
-    """Returns points [M, 2] without those within about a millimetre of the previous one."""
+    """Returns points [M, 2] without those closer than a millimetre to the previous one."""
     kept = [points[0]]
     for point in points[1:]:
         if np.hypot(*(point - kept[-1])) > SHORTEST_M:
@@ -72,19 +72,19 @@ def distinct_points(points: Array) -> Array:
 
 
 def parallel(points: Array, aside_m: float) -> Array:
-    """Returns a line [M, 2] with every stretch moved to its left by `aside_m`, corner by corner."""
+    """Returns a line [M, 2] whose stretches are all moved to their left by `aside_m`."""
     steps = np.diff(points, axis=0)
     normals = np.stack([-steps[:, 1], steps[:, 0]], axis=-1) / np.hypot(*steps.T)[:, None]
     before, after = np.vstack([normals[:1], normals]), np.vstack([normals, normals[-1:]])
-    # A corner moves along the bisector of its stretches' normals a and b, to the distance 1 from
-    # both: (a + b) / (1 + a · b). The bound is for hairpins, where they are opposite.
+    # A corner moves along the bisector of the normals a and b of its two stretches. For a distance
+    # of 1 from both it moves by (a + b) / (1 + a · b). The bound is for hairpins, where a = -b.
     share = np.maximum(1.0 + (before * after).sum(axis=-1), 1e-9)
     return points + aside_m * (before + after) / share[:, None]
 
 
 @dataclass(frozen=True)
 class Box:
-    """An upright box on the ground that can be hit; the front of a house faces its right."""
+    """An upright box on the ground that can be hit; the front of a house is on its right."""
 
     kind: Kind
     x_m: float  # of its centre
@@ -142,7 +142,7 @@ class Layout:
         paved = shapely.union_all([*wide, _with_round_corners(shapely.union_all(wide), radius)])
         self._paved = shapely.union(paved, self.drivable)
         self.sidewalks = self.terrain = shapely.Polygon()
-        # Without sidewalks, the rounding of corners would leave slivers.
+        # Sidewalks are left out, because rounding corners would leave slivers of them.
         if any(road.sidewalk_m > 0 for road in scene.roads):
             self.sidewalks = self._paved.difference(self.drivable)
         if scene.terrain_m > 0:
@@ -162,12 +162,13 @@ class Layout:
     def pose_at(self, road: str, at_m: float, offset_m: float = 0.0) -> tuple[float, float, float]:
         """Returns x, y and heading at a distance along a road, `offset_m` to its left."""
         line = self.lines[road]
-        # The heading is that of a short chord around the point, also where two pieces meet.
+        # The heading is that of a short chord around the point, which also works between two
+        # pieces.
         step = min(0.05, line.length / 4)
         middle = min(max(at_m, step), line.length - step)
         behind, ahead = (line.interpolate(middle + sign * step) for sign in (-1, 1))
         heading = math.atan2(ahead.y - behind.y, ahead.x - behind.x)
-        # shapely counts negative distances from the far end, and stops at either end.
+        # shapely counts negative distances from the far end, and doesn't go beyond the ends.
         on_road = min(max(at_m, 0.0), line.length)
         point, beyond = line.interpolate(on_road), at_m - on_road
         x, y = point.x + beyond * math.cos(heading), point.y + beyond * math.sin(heading)
@@ -195,7 +196,7 @@ class Layout:
         return parallel(self._walks[walk], lateral_m)
 
     def _walk_points(self, walk: Walk) -> Array:
-        given: Any = walk  # which keys are not None depends on its kind
+        given: Any = walk  # its kind determines which keys are not None
         if walk.kind == "points":
             return np.array(given.points_m)
         if walk.kind == "along":
@@ -204,7 +205,7 @@ class Layout:
         road = self.roads[given.road]
         # Keep a stride away from the house fronts.
         reach = road.width_m / 2 + road.sidewalk_m - 0.5
-        # From right to left across the road, so that the walk's left points back along the road.
+        # People cross from right to left, so that the walk's left points back along the road.
         return np.array([self.pose_at(road.name, given.at_m, y)[:2] for y in (-reach, reach)])
 
     def _road_between(self, road: str, from_m: float, to_m: float) -> shapely.Polygon:
@@ -222,8 +223,8 @@ class Layout:
         return CrosswalkArea(self._road_between(crosswalk.road, first, last), heading)
 
     def _buildings(self) -> tuple[Box, ...]:
-        # Houses draw in the order of the rows: a row added at the end leaves the others as they
-        # are.
+        # Random numbers are drawn in the order of the rows, so that a row that is added at the end
+        # doesn't change the others.
         rng = np.random.default_rng(self.scene.layout_seed)
         boxes: list[Box] = []
         for row in self.scene.building_rows:
@@ -246,7 +247,7 @@ class Layout:
     def _add_houses(self, row: BuildingRow, rng: np.random.Generator, houses: list[Box]) -> None:
         side = 1.0 if row.side == "left" else -1.0
         edge = self.roads[row.road].width_m / 2 + row.setback_m
-        # The last house may stand beyond to_m, but then not beyond the road too.
+        # The last house may extend beyond to_m, but not beyond the road's end.
         last_middle = max(row.to_m, self.lines[row.road].length)
         at = row.from_m
         while at < row.to_m:

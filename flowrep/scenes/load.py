@@ -1,4 +1,4 @@
-"""Loads a scene from its name, a YAML file or a mapping, and checks it; its schema for editors."""
+"""Loads and checks a scene, given by name, YAML file or mapping; writes the schema for editors."""
 
 import dataclasses
 import json
@@ -64,8 +64,8 @@ def _adapter() -> TypeAdapter[Scene]:
     return TypeAdapter(Scene)
 
 
-# Many environments are made from the same scene, which need not be checked again. Pickled, since a
-# scene holds mappings and has no hash.
+# Many envs use the same scene, which is then checked only once. The key of the cache is the pickled
+# scene, because scenes contain mappings and have no hash.
 @lru_cache(maxsize=8)
 def _checked(pickled: bytes) -> Scene:
     scene = pickle.loads(pickled)
@@ -88,7 +88,8 @@ def _loaded(data: Any, source: str) -> Scene:
 
 
 def _complaint(error: ValidationError) -> str:
-    # A misspelt key is also reported as missing under its right name: name the misspelling.
+    # pydantic reports a misspelt key twice: as unknown, and as missing under its right name. Report
+    # the misspelling.
     first = min(error.errors(), key=lambda each: each["type"] != "unexpected_keyword_argument")
     key = "".join(f"[{at}]" if isinstance(at, int) else f".{at}" for at in first["loc"])[1:]
     if first["type"] == "unexpected_keyword_argument":

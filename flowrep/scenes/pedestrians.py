@@ -1,4 +1,4 @@
-"""People: their parts, the parallel lanes that they walk in, and where they are at any time.
+"""People: their parts, the parallel lanes in which they walk, and their poses at any time.
 
 Convention: a person's pose is (x, y, yaw, swing): position, heading, and the angle in radians by
 which the left leg is swung backwards and the right leg forwards about the axis of the hips.
@@ -17,8 +17,8 @@ from flowrep.scenes.scene import Range
 Array = NDArray[Any]
 
 RADIUS_M, HEIGHT_M = 0.3, 1.75  # of the collision cylinder
-APART_M = 2 * RADIUS_M  # between the centres of two who touch
-LANE_M = APART_M + 0.01  # least distance of neighbouring lanes: rounding must not make people touch
+APART_M = 2 * RADIUS_M  # distance between the centres of two people who touch
+LANE_M = APART_M + 0.01  # least distance between lanes; with rounding, people still don't touch
 PARTS = ("upper body", "left leg", "right leg")
 HIP_M, _HIP_ASIDE_M = 0.82, 0.1  # height of the hips, and their distance from the middle
 _SIDES = np.array([1.0, -1.0])  # of the legs: left is +y
@@ -59,18 +59,18 @@ def quaternions_of_parts(poses: Array) -> Array:
 
 
 def keeps_its_stretches(points: Array, aside_m: float) -> bool:
-    """Returns whether a line that is moved aside keeps all its stretches, none reversed."""
-    # A stretch's length is linear in `aside_m`: what holds at two distances holds between them.
+    """Returns whether no stretch of a line vanishes or reverses when the line is moved aside."""
+    # A stretch's length is linear in `aside_m`, so what holds at two distances holds in between.
     steps = np.diff(points, axis=0)
     moved = np.diff(parallel(points, aside_m), axis=0)
     return bool(((steps * moved).sum(axis=-1) > SHORTEST_M * np.hypot(*steps.T)).all())
 
 
 def keeps_lanes_apart(points: Array, spread_m: float) -> bool:
-    """Returns whether lanes within `spread_m` keep their distances all along a walk."""
-    # They do if the strip of all lanes, widened by half a person's room, does not overlap itself:
-    # the only way from one lane to another is then across all lanes between them, or out of the
-    # strip and in again.
+    """Returns whether the lanes within `spread_m` keep their distances all along a walk."""
+    # They do if the strip of all lanes, widened by half of the distance that people keep, doesn't
+    # overlap itself: one can then get from one lane to another only across all lanes in between, or
+    # by leaving the strip.
     reach, room = spread_m / 2 + APART_M / 2, APART_M / 2
     first, last = points[1] - points[0], points[-1] - points[-2]
     longer = points.astype(np.float64)
@@ -83,7 +83,7 @@ def keeps_lanes_apart(points: Array, spread_m: float) -> bool:
 
 
 def covered_ground(points: Array, spread_m: float) -> list[shapely.Geometry]:
-    """Returns the ground that the lanes of a walk can cover, a convex piece for each stretch."""
+    """Returns the ground that the lanes of a walk can cover, as one convex piece per stretch."""
     right, left = (parallel(points, side * spread_m / 2) for side in (-1, 1))
     corners = np.stack([right[:-1], right[1:], left[1:], left[:-1]], axis=1)
     return list(shapely.convex_hull(shapely.multipoints(corners)))
@@ -97,33 +97,34 @@ def least_spread_m(count: int) -> float:
 def draw_lanes(count: int, spread_m: float, rng: np.random.Generator) -> Array:
     """Returns each person's lane [P] as its distance in metres to the left of the walk."""
     # All placements within `spread_m` that are at least `LANE_M` apart are equally likely, and so
-    # are all orders of the people. Sorted uniform numbers on the width that is left, each moved
-    # aside by the lanes before it, have that distribution without a draw that must be repeated.
+    # are all orders of the people. To draw one without rejection: subtract the required distances
+    # from the width, draw sorted uniform numbers in what is left, and add the distances again.
     free = max(spread_m - least_spread_m(count), 0.0)
     lanes = np.sort(rng.uniform(0.0, 1.0, count)) * free + LANE_M * np.arange(count)
     return rng.permutation(lanes - spread_m / 2)
 
 
-_TURN_S = 0.6  # about-turn at either end of a walk
+_TURN_S = 0.6  # duration of the turn at either end of a walk
 _STRIDE_M = 1.4  # one step with each leg
 _SWING_RAD = 0.38  # of a leg, either way: feet 0.6 m apart
-_OUT_OF_STEP_RAD = 2.4  # offset between neighbours, so that a group does not march in step
+_OUT_OF_STEP_RAD = 2.4  # phase between neighbours, so that a group does not march in step
 
 
 class Crowd:
     """All people of one episode, whose poses at any time have a closed form.
 
-    Each walks a line to its end and back for ever, from a phase in [0, 1) of that round trip.
+    Each person walks to the end of a line and back, again and again, and starts at a phase in [0,
+    1) of this round trip.
 
     Args:
-        lines: everyone's line, points [M, 2] in metres.
-        speeds_mps: [P]; people with 0 stand.
+        lines: P lines, points [M, 2] in metres each.
+        speeds_mps: [P]; people with speed 0 stand.
         phases: [P].
     """
 
     def __init__(self, lines: list[Array], speeds_mps: Array, phases: Array) -> None:
         most = max((len(line) for line in lines), default=2)
-        # One array for all lines: shorter ones repeat their last point, which adds no length.
+        # One array holds all lines; shorter ones repeat their last point, which adds no length.
         padded = [line[np.minimum(np.arange(most), len(line) - 1)] for line in lines]
         self._points = np.array(padded).reshape(len(lines), most, 2)  # [P, M, 2]
         steps = np.diff(self._points, axis=1)
@@ -153,7 +154,7 @@ class Crowd:
         poses[..., 2] = headings + self._facing(along)
         walked = self._start + self._speeds * time_s
         step = walked * (2 * math.pi / _STRIDE_M) + self._out_of_step
-        # People who stand have one foot in front of the other.
+        # Standing people have one foot in front of the other.
         poses[..., 3] = _SWING_RAD * np.where(self._speeds > 0, np.sin(step), 1.0)
         return poses
 
@@ -164,7 +165,7 @@ class Crowd:
         return Crowd(list(self._points), speeds, phases)
 
     def _along(self, time_s: float | Array) -> Array:
-        # Metres walked since the near end, in [0, length of the round trip).
+        # Metres walked since the start of the line, in [0, length of the round trip).
         return (self._start + self._speeds * time_s) % self._there_and_back
 
     def _on_lines(self, along: Array) -> tuple[Array, Array]:
@@ -176,9 +177,9 @@ class Crowd:
         return points + (at - self._marks[here])[..., None] * directions, self._headings[here]
 
     def _facing(self, along: Array) -> Array:
-        # The angle to the heading of the way out: 0 on it, π on the way back. At either end a
-        # person turns uniformly over _TURN_S, half of it before the end and half after, while
-        # walking on.
+        # The angle to the heading of the way out is 0 on the way out and π on the way back. At
+        # either end a person turns uniformly during _TURN_S, half of it before the end and half
+        # after it, without stopping.
         past_far_end = along - self._length
         is_back = past_far_end > 0
         past_near_end = along - is_back * self._there_and_back

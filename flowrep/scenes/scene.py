@@ -27,7 +27,7 @@ CATEGORY_ID: dict[str, int] = {name: number for number, name in enumerate(CATEGO
 # The semantic class of each kind: lamp posts share that of buildings.
 CATEGORY_OF_KIND: dict[Kind, str] = {kind: kind for kind in get_args(Kind)}
 CATEGORY_OF_KIND |= {"house": "building", "lamp_post": "building"}
-# Of kinds with wheels or lamps of a fixed size; others may have any height.
+# Least heights of kinds with wheels or lamps of a fixed size; others may have any height.
 LEAST_HEIGHT_M: dict[Kind, float] = {"car": 0.7, "traffic_light": 1.0, "lamp_post": 0.3}
 
 
@@ -180,7 +180,7 @@ class Zone(Part):
 
 @dataclass(frozen=True)
 class Path(Part):
-    """One task: from a start zone to an ending zone, with exits closed."""
+    """The task of an episode: from a start zone to an end zone, with some exits closed."""
 
     name: Name
     start: Name
@@ -289,7 +289,7 @@ class Obstacle(Part):
 
 @dataclass(frozen=True)
 class ObstacleRow(Part):
-    """Obstacles of one kind along a road, `offset_m` to the left of its middle.
+    """Obstacles of one kind along a road, `offset_m` to the left of its centreline.
 
     They face like parked cars in right-hand traffic: along the road on the right, against it on the
     left. Obstacles that would stand on another road or in a house are left out.
@@ -322,8 +322,8 @@ class Scene(Part):
     """A complete scene as data; `load_scene` reads and checks one.
 
     Grass covers the ground between the roads and up to `terrain_m` beyond their bounds; 0 for none.
-    `corner_radius_m` rounds the kerb where roads meet. `symmetric` says that a drive's left-right
-    image is a drive in this scene, too, so that an agent may learn from images.
+    `corner_radius_m` rounds the kerb where roads meet. `symmetric` says that the mirror image of a
+    drive is a possible drive in this scene, too, so that an agent may learn from mirror images.
     """
 
     name: FileName

@@ -1,4 +1,4 @@
-"""The vehicle: its state, its actions, how it turns and rolls, and the ground that it covers.
+"""The vehicle: its state, actions, motion and footprint.
 
 Convention: world metres, x forward at yaw 0, yaw and yaw rate counter-clockwise in radians. States
 hold scalars, or arrays of one shape, so that the planner can drive many vehicles at once.
@@ -38,8 +38,8 @@ def roll(state: VehicleState, dt_s: float, speed_mps: float) -> VehicleState:
     """Returns the exact state after driving for `dt_s` along the arc of its yaw rate."""
     xp: Any = np if isinstance(state.yaw_rate_rps, np.ndarray) else math
     angle = state.yaw_rate_rps * dt_s
-    # The chord of an arc of length d and angle a is d·sin(a/2)/(a/2), along the mean heading. A
-    # tiny angle replaces 0, so that the quotient is 1.
+    # An arc of length d and angle a has a chord of length d·sin(a/2)/(a/2) along the mean heading.
+    # A tiny angle replaces 0, so that the quotient is 1 then.
     half = 0.5 * angle
     half_or_tiny = half + (half == 0.0) * 1e-20
     chord = speed_mps * dt_s * (xp.sin(half_or_tiny) / half_or_tiny)

@@ -27,7 +27,7 @@ _BOXES_A_BODY = 16  # PyBullet's limit for one compound shape
 
 
 class SafeGround:
-    """A table of where a vehicle is certainly clear of edges, boxes and ending zones.
+    """A table of where a vehicle is certainly clear of edges, boxes and end zones.
 
     Elsewhere the exact and slower tests of PyBullet and shapely decide, as they do near people.
     """

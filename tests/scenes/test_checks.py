@@ -90,7 +90,7 @@ def refusal(data, changes):
         ({"obstacles.0.center_m": [3.0, 0.0]}, "paths.left: its start collides"),
         (
             {"closures.1.at_m": 65.0, "paths.1.closures": ["right_arm"]},
-            "paths.right: its ending zone is built over",
+            "paths.right: its end zone is built over",
         ),
         ({"paths.0.closures": ["left_arm"]}, "paths.left: no free road leads from 'south' to 'w"),
         ({"paths.0.end": "south"}, "paths.left: starts inside"),
