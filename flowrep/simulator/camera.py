@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from flowrep.extras import numba_is_installed
 from flowrep.simulator.motion import rigid_inverse
 
-if TYPE_CHECKING:  # scenes need shapely and pydantic; a camera in another simulator doesn't
+if TYPE_CHECKING:  # scenes need shapely and pydantic, which `flowrep.pybullet` shouldn't import
     from flowrep.scenes.scene import CameraConfig
 
 Matrix = NDArray[np.float64]
@@ -67,7 +67,7 @@ def pose_of_view(view: Sequence[float]) -> Matrix:
 
 
 def vehicle_from_camera(camera: CameraConfig) -> Matrix:
-    """Returns the camera's mount [4, 4], from camera axes to the vehicle's (x forward, z up)."""
+    """Returns the camera's pose on the vehicle [4, 4] (vehicle axes: x forward, z up)."""
     pitch = math.radians(camera.pitch_deg)
     sine, cosine = math.sin(pitch), math.cos(pitch)
     return np.array(
@@ -84,8 +84,8 @@ def depth_from_zbuffer(
     zbuffer: NDArray[np.float32], near_m: float, far_m: float
 ) -> NDArray[np.float32]:
     """Returns depth along z in metres from OpenGL depth-buffer values in [0, 1]."""
-    # In the usual formula, far - (far - near) · z cancels near z = 1. There 1 - z is exact in
-    # float32.
+    # The usual formula has far - (far - near) · z, which loses precision near z = 1. There, 1 - z
+    # is exact in float32.
     gap = (np.float32(1.0) - zbuffer) * np.float32(far_m - near_m) + np.float32(near_m)
     return np.float32(far_m * near_m) / gap
 

@@ -15,7 +15,8 @@ from flowrep.scenes.scene import Kind
 from flowrep.simulator.paint import SHIRTS, Painted, Patch, front, painted, swatch, upper_storeys
 
 Array = NDArray[np.float64]
-# Smaller chunks have more bounding spheres to test, larger ones project more that is out of view.
+# With smaller chunks there are more bounding spheres to test, with larger ones more triangles that
+# are out of view are projected.
 _CHUNK_TRIANGLES = 24
 
 
@@ -27,15 +28,15 @@ class Body:
     triangles: NDArray[np.int64]  # [T, 3], vertices, counter-clockwise seen from outside
     semantic: int
     instance: int  # 0 for the static world
-    uvs: NDArray[np.float64] | None = None  # [V, 2], in the texture; plain asphalt without
+    uvs: NDArray[np.float64] | None = None  # [V, 2], in the texture; None is plain asphalt
 
 
 class Triangles(NamedTuple):
     """All bodies, in C chunks, as arrays for the rasteriser."""
 
     points: NDArray[np.float64]  # [V, 3], in the frames of their bodies
-    corners: NDArray[np.int32]  # [T, 3], indices of a chunk's own points
-    point_bounds: NDArray[np.int32]  # [C + 1], chunk c has the points from entry c to c + 1
+    corners: NDArray[np.int32]  # [T, 3], indices among the points of the triangle's chunk
+    point_bounds: NDArray[np.int32]  # [C + 1], chunk c has points bounds[c] to bounds[c + 1] - 1
     corner_bounds: NDArray[np.int32]  # [C + 1], the same for triangles
     centres: NDArray[np.float64]  # [C, 3], of the chunks' bounding spheres
     radii: NDArray[np.float64]  # [C]
@@ -86,7 +87,7 @@ def gather(bodies: Sequence[Body]) -> Triangles:
 
 
 def _chunks(middles: NDArray[np.float64], triangles: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Returns triangles in groups of neighbours; `middles` are those of all triangles."""
+    """Returns groups of neighbouring triangles; `middles` [T, 3] are the triangles' centres."""
     if len(triangles) <= _CHUNK_TRIANGLES:
         return [triangles]
     # Halved across the longest side, as a k-d tree is, so that bounding spheres stay small.
@@ -97,11 +98,11 @@ def _chunks(middles: NDArray[np.float64], triangles: NDArray[np.int64]) -> list[
 
 
 Point3 = tuple[float, float, float]
-_CELL_M = 15.0  # cells that the ground is cut into: small triangles are interpolated better
+_CELL_M = 15.0  # the ground is cut into cells, because small triangles are interpolated better
 _DASH_M, _DASH_PERIOD_M, _DASH_WIDTH_M = 2.0, 6.0, 0.15  # of lane marks
 _STRIPE_M = 0.5  # width of a crosswalk's stripes, and of the gaps between them
 _KERB_M = 0.25  # width of kerbstones
-_RISE_M = 0.004  # of markings above the ground, or the two would flicker through each other
+_RISE_M = 0.004  # height of markings above the ground; at the same height the two would flicker
 
 
 class Mesh:
@@ -116,10 +117,10 @@ class Mesh:
     def polygon(self, corners: Array, uvs: list[list[float]]) -> None:
         """Adds a flat convex polygon [M, 3], counter-clockwise seen from outside."""
         (ax, ay, az), (bx, by, bz) = (corners[1:3] - corners[0]).tolist()
-        # Written out: numpy.cross would take most of the time that a street takes to build.
+        # Written out, because numpy.cross would take most of the time in which a street is built.
         normal = np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
         normal /= np.linalg.norm(normal)
-        # A fan of triangles from the first corner, which is right for convex polygons alone.
+        # A fan of triangles from the first corner, which is only right for convex polygons.
         base = len(self.vertices)
         self.vertices += corners.tolist()
         self.normals += [normal.tolist()] * len(corners)
@@ -172,7 +173,7 @@ class Mesh:
             return
         uv = [list(swatch(paint)[:2])] * 3
         x0, y0, x1, y1 = area.bounds
-        # Constrained, so that holes and inward corners of the area stay open.
+        # A constrained triangulation, so that holes and inward corners of the area stay open.
         for x in np.arange(x0, x1, _CELL_M):
             for y in np.arange(y0, y1, _CELL_M):
                 cell = shapely.intersection(area, shapely.box(x, y, x + _CELL_M, y + _CELL_M))
@@ -209,8 +210,8 @@ def lane_marks(line: shapely.LineString, clear_of: shapely.Geometry) -> Mesh:
 
 def kerb(drivable: shapely.Geometry, paved: shapely.Geometry) -> Mesh:
     """Returns the kerbstones along the edge of a sidewalk."""
-    # The paving continues below them: the renderer omits thin triangles in the distance, where the
-    # same category then shows instead.
+    # The paving continues below them. The renderer omits thin triangles in the distance, and the
+    # paving, which has the same category, shows instead.
     mesh = Mesh()
     edge = drivable.buffer(_KERB_M, quad_segs=4, join_style="mitre")
     mesh.ground(paved.intersection(edge), _RISE_M, "kerb")
@@ -253,9 +254,9 @@ def mesh_of(box: Box, *, both_sides: bool = False) -> Mesh:
     return mesh
 
 
-# Shapes of the kinds, facing along x: `x` and `y` are half of the length and width that a vehicle
-# can hit. Other numbers are proportions or metres that look right, chosen by eye; crowns, arms and
-# lamps may reach beyond the box, as nothing on the ground can touch them.
+# Shapes of the kinds of obstacles, facing along x. `x` and `y` are half of the length and width of
+# the box that a vehicle can hit. Other numbers are proportions or metres, chosen by eye. Crowns,
+# arms and lamps may extend beyond the box, because nothing on the ground can touch them.
 
 
 def _car(mesh: Mesh, x: float, y: float, height: float, variant: int) -> None:
@@ -304,7 +305,7 @@ def _traffic_light(mesh: Mesh, x: float, y: float, height: float, variant: int) 
     head_m, reach = 0.95, 0.17
     mesh.box((-x, -y, 0.0), (x, y, height - head_m), swatch("metal"), lid=False)
     mesh.box((-reach, -reach, height - head_m), (reach, reach, height), swatch("tyre"))
-    # The lowest lamp is lit, for those who drive along x.
+    # The lowest lamp is lit; those who drive along x see it.
     for name, share in (("lamp_off", 0.83), ("lamp_off", 0.5), ("lamp_green", 0.17)):
         centre = (-reach - 0.01, 0.0, height - head_m * (1 - share))
         mesh.disc(centre, (-1.0, 0.0, 0.0), 0.12, swatch(name))
@@ -341,8 +342,8 @@ def person_meshes(variant: int) -> tuple[Mesh, ...]:
     """Returns the meshes of a person's `PARTS`, facing along x; the origin of a leg is its hip."""
     shirt, skin = swatch(SHIRTS[variant % len(SHIRTS)]), swatch("skin")
     body = Mesh()
-    # One arm swings forward, one back. Seen from the side, as a vehicle sees people who cross, the
-    # arms span 0.6 m: the diameter of the cylinder that collisions are tested with.
+    # One arm swings forward, one back. Seen from the side, as people who cross the street are, the
+    # arms span 0.6 m, the diameter of the collision cylinder.
     for y, arm in ((-0.26, 0.19), (0.26, -0.19)):
         body.box((arm - 0.11, y - 0.05, 0.95), (arm + 0.11, y + 0.05, 1.35), shirt)
         body.box((arm - 0.05, y - 0.05, 0.85), (arm + 0.11, y + 0.05, 0.95), skin, lid=False)

@@ -1,9 +1,9 @@
 """Rigid poses and the motions between them, in numpy and float64.
 
-`flowrep.geometry` has the same functions for tensors, with the same results once they are rounded
-to float32. These exist for worker processes, which step environments without PyTorch: importing it
-takes a second and 160 MiB in each. For the few matrices of a step they are also 2 to 8 times as
-fast (26 us instead of 212 for one environment, 0.7 ms instead of 1.3 for 96).
+`flowrep.geometry` has the same functions for tensors, with the same results after rounding to
+float32. These versions exist for worker processes, which step envs without PyTorch: importing it
+would take a second and 160 MiB in each. For the few matrices of a step they are also 2 to 8 times
+as fast (26 us instead of 212 us for one env, 0.7 ms instead of 1.3 ms for 96).
 """
 
 from typing import Any
@@ -38,7 +38,8 @@ def rigid_inverse(a_from_b: Array) -> Array:
 def relative_motion(world_from_prev: Array, world_from_curr: Array) -> Array:
     """Returns prev_from_curr [..., 4, 4]; exactly the identity if the camera did not move."""
     motion = rigid_inverse(world_from_prev) @ world_from_curr
-    # A matrix times its inverse is the identity only up to rounding, and flow would not be 0.
+    # A matrix times its inverse is the identity only up to rounding, so flow would not be exactly
+    # 0.
     motion[(world_from_prev == world_from_curr).all(axis=(-2, -1))] = np.eye(4)
     return motion
 
@@ -55,11 +56,12 @@ def instance_motion(
     camera's, at the previous step.
     """
     static = relative_motion(world_from_prev, world_from_curr)[..., None, :, :]
-    # A point keeps its position in the body's frame, which joins the two steps: from the current
-    # camera to the body as it is now, then from the body as it was to the previous camera.
+    # A point of a body has the same body coordinates at both steps. Transform it from the current
+    # camera to the body at its current pose, then from the body at its previous pose to the
+    # previous camera.
     body_from_curr = rigid_inverse(world_from_curr_body) @ world_from_curr[..., None, :, :]
     prev_from_world = rigid_inverse(world_from_prev)[..., None, :, :]
     carried = prev_from_world @ world_from_prev_body @ body_from_curr
-    # Bodies that kept their pose get exactly row 0, so that their object flow is exactly 0.
+    # Bodies that did not move get row 0 exactly, so that their object flow is exactly 0.
     moved = (world_from_curr_body != world_from_prev_body).any(axis=(-2, -1))
     return np.concatenate([static, np.where(moved[..., None, None], carried, static)], axis=-3)

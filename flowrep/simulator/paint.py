@@ -1,8 +1,7 @@
 """Paint: plain colours and house fronts in one small texture, and the grain on every surface.
 
-PyBullet's picture shows the texture alone. The rasteriser's multiplies it by a grain, so that roads
-and clothes have something to follow: without it, the flow estimated from two pictures of plain
-asphalt is 0.
+PyBullet's pictures show the texture alone. The rasteriser multiplies it by a grain, so that flow
+can be estimated on roads and clothes, too; on plain asphalt, estimated flow is 0.
 """
 
 from functools import cache
@@ -17,24 +16,24 @@ SIZE_PX = 256  # a side of the texture
 _SWATCH_PX = 8
 _FRONT_PX = (60, 64)  # height, width of one house front in the texture
 _FLOORS = (2, 3, 4, 5)
-# Shares of light from everywhere and from the sun, and the direction to it, in the world.
+# Shares of ambient light and of sunlight, and the direction to the sun in the world.
 AMBIENT, DIFFUSE = 0.62, 0.46
 LIGHT = tuple((np.array([-4.0, 3.0, 9.0]) / np.linalg.norm([-4.0, 3.0, 9.0])).tolist())
 
-GRAIN_SIZE, FRONT_SIZE = 512, 64  # texels a side; of a house front as the rasteriser has it
-# So the grain of roads repeats every 20 m, and that of people, who are small in the picture and
-# have to show texture too, every 2.6 m.
+GRAIN_SIZE, FRONT_SIZE = 512, 64  # texels per side, of the grain and of the rasteriser's fronts
+# With these, the grain of roads repeats every 20 m. That of people repeats every 2.6 m, because
+# they are small in the picture but must show texture, too.
 _TEXELS_A_M, _PEOPLE_TEXELS_A_M = 25.0, 200.0
-_SLOPE = 1.2  # of the grain's spectrum; at 1 every octave has the same contrast
-_COARSEST_WAVES = 5  # over the grain's size: 4 m on roads
-# The grain's standard deviation, as a share of the colour. Enough for DIS to follow roads and
-# people (docs/scenes.md), and they still look like asphalt and clothes. A slope of 0.8 doubles the
-# road's error, and contrasts of 1 raise that of people.
+_SLOPE = 1.2  # exponent of the grain's spectrum; at 1 every octave has the same contrast
+_COARSEST_WAVES = 5  # number of the longest waves over the grain's size; they are 4 m long on roads
+# The standard deviation of the grain, as a share of the colour. It suffices for DIS to follow roads
+# and people (docs/scenes.md), which still look like asphalt and clothes. A slope of 0.8 doubles the
+# error on roads; contrasts of 1 increase that on people.
 _CONTRAST_OF = {"road": 0.3, "crosswalk": 0.3, "sidewalk": 0.2, "terrain": 0.3, "tree": 0.3}
 _CONTRAST_OF |= {"pedestrian": 0.3, "building": 0.12, "fence": 0.2}
 _CONTRAST = [_CONTRAST_OF.get(name, 0.1) for name in CATEGORY_ID]  # by class
 
-SKY = (112, 178, 232)  # where nothing is; that of maps in `flowrep.viz` too
+SKY = (112, 178, 232)  # the colour of the sky, which `flowrep.viz` uses for maps, too
 PAINTS: dict[str, tuple[int, int, int]] = {
     "asphalt": (84, 84, 90),
     "lane_mark": (226, 222, 206),
@@ -83,7 +82,7 @@ def front(variant: int) -> Patch:
     """Returns a variant's house front; there are `NUM_FRONTS`, which repeat."""
     row, column = divmod(variant % NUM_FRONTS, len(_WALLS))
     (height, width), (top, left) = _FRONT_PX, _corner(row, column)
-    # Half a texel within its border, or neighbouring fronts would bleed in.
+    # Half a texel inside its border; otherwise neighbouring fronts would bleed in.
     pixels = np.array([left + 0.5, top + 0.5, left + width - 0.5, top + height - 0.5])
     u0, v0, u1, v1 = (pixels / SIZE_PX).tolist()
     return (u0, v0, u1, v1)
@@ -146,8 +145,9 @@ def painted(
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normals = np.cross(a, b)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    # The grain lies on level ground as a map does, so it runs on over its triangles. On other faces
-    # its axes are the level direction along the face and the one across.
+    # On level ground, the grain's axes are the world's, so that it continues from triangle to
+    # triangle. On other faces, its axes are the horizontal direction in the face and the one
+    # across.
     is_level = np.abs(normals[:, 2]) > 0.9
     along = np.stack([-normals[:, 1], normals[:, 0], np.zeros(len(a))], axis=1)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)  # 0 if level
@@ -155,9 +155,8 @@ def painted(
     across = np.cross(normals, along)
     across[is_level] = 0.0, 1.0, 0.0
     per_m = np.where(instance > 0, _PEOPLE_TEXELS_A_M, _TEXELS_A_M)
-    # Offsets, in metres of the face's distance from the origin and by instance, so that parallel
-    # faces and different people don't show the same part of the grain. Any irrational-looking
-    # numbers do.
+    # Offsets by the face's distance from the origin (in metres) and by instance, so that parallel
+    # faces and different people don't show the same part of the grain. The numbers are arbitrary.
     plane_m = np.where(is_level, 0.0, (normals * corners[:, 0]).sum(axis=1))
     grain_axes = np.zeros((len(a), 2, 4))
     grain_axes[:, 0, :3], grain_axes[:, 1, :3] = per_m[:, None] * along, per_m[:, None] * across
@@ -168,8 +167,8 @@ def painted(
     is_front = np.ptp(uvs, axis=1).max(axis=1, initial=0.0) > 0.0
     column_of_front, row_of_front = column // _FRONT_PX[1], (row - _SWATCH_PX) // _FRONT_PX[0]
     fronts = np.where(is_front, row_of_front * len(_WALLS) + column_of_front, -1)
-    # The affine map that takes a triangle's corners to texels. Its linear part [2, 3] takes the
-    # edges a and b to their differences in texels, and the normal to 0: steps · [a b n]⁻¹.
+    # The affine map from a triangle's points to texels. Its linear part [2, 3] maps the edges a and
+    # b to their differences in texels, and the normal n to 0: steps · [a b n]⁻¹.
     front_axes = np.zeros((len(a), 2, 4))
     for i in np.flatnonzero(is_front):
         top, left = _corner(row_of_front[i], column_of_front[i])
@@ -191,16 +190,16 @@ def painted(
 def grain() -> NDArray[np.float32]:
     """Returns a periodic random pattern of mean 0 and deviation 1, and its coarser levels.
 
-    Level l has texels 2^l times as large and is the pattern after a Gaussian blur of half such a
-    texel, which leaves nothing to alias: `[2 * GRAIN_SIZE, GRAIN_SIZE, 2]`, see
-    `_below_each_other`. Beside each texel is the next level's value at the same point, so that one
-    look-up blends the two.
+    Level l has texels 2^l times as large. It is the pattern after a Gaussian blur of half such a
+    texel, which prevents aliasing. The levels are in one array `[2 * GRAIN_SIZE, GRAIN_SIZE, 2]`,
+    see `_below_each_other`; the second channel is the next level's value at the same point, so that
+    one look-up can blend two levels.
     """
     frequency = np.fft.fftfreq(GRAIN_SIZE)  # cycles a texel
     radius = np.hypot(frequency[:, None], frequency)
     noise = np.random.default_rng(0).standard_normal((GRAIN_SIZE, GRAIN_SIZE))
-    # White noise with an amplitude of 1 / f^slope, without waves longer than a few metres, which
-    # would give large areas different colours.
+    # White noise with an amplitude of 1 / f^slope, without waves longer than a few metres, because
+    # large areas would differ in colour.
     spectrum = np.fft.fft2(noise) / np.maximum(radius, 1 / GRAIN_SIZE) ** _SLOPE
     spectrum[radius < _COARSEST_WAVES / GRAIN_SIZE] = 0.0
     spectrum /= np.fft.ifft2(spectrum).real.std()

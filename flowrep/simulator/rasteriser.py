@@ -1,10 +1,11 @@
-"""A fast rasteriser for depth, class, instance and colour maps, ten times as fast as PyBullet's.
+"""A rasteriser for depth, class, instance and colour maps, ten times as fast as PyBullet's.
 
-It draws by edge functions in homogeneous coordinates (Olano and Greer, 1997). A corner becomes
-q = z · (u, v, 1), pixel coordinates times depth. In these coordinates the edges of a triangle are
-planes through the camera, e_a = q_b × q_c, and pixel r = (u, v, 1) lies inside if e_a · r ≥ 0 for
-all three. With d = q_a · e_a the inverse depth is (e_a + e_b + e_c) · r / d, affine in u and v.
-Both also hold for corners behind the camera, so no triangle has to be clipped.
+It uses edge functions in homogeneous coordinates (Olano and Greer, 1997). A corner becomes q = z ·
+(u, v, 1), pixel coordinates times depth. In these coordinates, an edge of a triangle with corners
+a, b, c is a plane through the camera, e_a = q_b × q_c, and the triangle covers the pixel r = (u, v,
+1) if e_a · r, e_b · r and e_c · r are all ≥ 0. With d = q_a · e_a, the inverse depth at r is (e_a +
+e_b + e_c) · r / d, which is affine in u and v. All of this also holds for corners behind the
+camera, so no triangle has to be clipped.
 """
 
 import math
@@ -24,15 +25,15 @@ _FRONT_LEVELS = FRONT_SIZE.bit_length()
 _NO_TABLES = np.empty((0, 0, 2), np.float32), np.empty((0, 0, 0, 3), np.float32)
 
 
-# numpy's error model saves a branch at each division: a tenth of the time of large scenes.
-# fastmath is for colours alone: it reorders sums, and maps must not depend on the compiler.
+# numpy's error model saves a branch at each division, a tenth of the time of large scenes. fastmath
+# is used for colours alone: it reorders sums, but maps must not depend on the compiler.
 _compiled = compiled(error_model="numpy")
 _shading = compiled(error_model="numpy", fastmath=True)
 _inlined = compiled(error_model="numpy", fastmath=True, inline="always")
 
 
 class Maps(NamedTuple):
-    """Maps of N views [N, H, W]: inf, class 0 and instance 0 for pixels without a surface."""
+    """Maps of N views [N, H, W]; a pixel without a surface has depth inf, class 0, instance 0."""
 
     depth: NDArray[np.float32]  # metres along z
     semantic: NDArray[np.uint8]
@@ -50,10 +51,10 @@ class Rasteriser:
         size: tuple[int, int],  # height, width
         range_m: tuple[float, float],  # of the visible depths
     ) -> None:
-        # Kernels count pixels by index, and column i is sampled at u = i + 0.5.
+        # Kernels use pixel indices as coordinates, but column i is sampled at u = i + 0.5.
         K_of_index = K - np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
         shape = triangles[: triangles._fields.index("poses") + 1]
-        # A pixel knows its triangle, so classes, instances and poses are stored by triangle.
+        # A pixel stores its triangle, so classes, instances and poses are looked up by triangle.
         counts = np.diff(triangles.corner_bounds)
         owners, poses = np.repeat(triangles.bodies, counts), np.repeat(triangles.poses, counts)
         ids = triangles.semantic[owners], triangles.instance[owners]
@@ -90,18 +91,17 @@ def _draw(
     K, near_m, far_m, look, cam_from_world, world_from_body, is_shown,
     depth, semantic, instance, rgb,
 ):  # fmt: skip
-    # The arrays are those of `Triangles`, `Rasteriser.__call__` and `Maps`, with their shapes
-    # there. `inverse` is a z-buffer of inverse depths: nearer is larger. It starts with the far
-    # plane's, and `number`, the triangle that a pixel shows, with the sky's -1. Each triangle takes
-    # the pixels where it is nearer; ids and colours are looked up once, when all triangles are
-    # drawn.
+    # `Triangles`, `Rasteriser.__call__` and `Maps` describe the arrays and their shapes. `inverse`
+    # [H, W] is a z-buffer of inverse depths (larger is nearer), which starts at the far plane.
+    # `number` [H, W] is the triangle that a pixel shows, at first -1, the sky. Each triangle takes
+    # the pixels where it is nearer. Ids and colours are looked up once, after all triangles.
     views, height, width = depth.shape
     planes = _side_planes(K, height, width)
     most = (point_bounds[1:] - point_bounds[:-1]).max()
     q = np.empty((most, 3))
     inverse = np.empty((height, width))
     number = np.empty((height, width), dtype=np.int32)
-    into = np.empty((3, 4))  # cam_from_body, written anew for each chunk
+    into = np.empty((3, 4))  # cam_from_body of the current chunk
     for n in range(views):
         inverse[:] = 1.0 / far_m
         number[:] = -1
@@ -109,7 +109,7 @@ def _draw(
             if not is_shown[n, bodies[c]]:
                 continue
             _compose(cam_from_world[n], world_from_body[n], poses[c], into)
-            # Chunks of up to 24 triangles have a bounding sphere: most are out of view.
+            # Most chunks (up to 24 triangles) are out of view, which their bounding sphere shows.
             if _is_outside(into, centres[c], radii[c], planes, near_m, far_m):
                 continue
             first = point_bounds[c]
@@ -125,8 +125,8 @@ def _draw(
 
 @_compiled
 def _side_planes(K, height, width):
-    # Inward unit normals [4, 3] of the planes through the camera and the outermost samples: of the
-    # columns 0 and width - 1 (x / z at `left` and `right`) and the rows 0 and height - 1.
+    # Inward unit normals [4, 3] of the planes through the camera and the outermost samples: columns
+    # 0 and width - 1 (where x / z is `left` and `right`) and rows 0 and height - 1.
     left, right = -K[0, 2] / K[0, 0], (width - 1 - K[0, 2]) / K[0, 0]
     top, bottom = -K[1, 2] / K[1, 1], (height - 1 - K[1, 2]) / K[1, 1]
     sides = [[1.0, 0.0, -left], [-1.0, 0.0, right], [0.0, 1.0, -top], [0.0, -1.0, bottom]]
@@ -138,8 +138,8 @@ def _side_planes(K, height, width):
 
 @_compiled
 def _compose(cam_from_world, world_from_body, pose, into):
-    # cam_from_body [3, 4]; pose -1 is the static world, whose points are in world axes already.
-    # Written out, since numba's `@` calls scipy's BLAS, and streets don't need scipy otherwise.
+    # Writes cam_from_body [3, 4]; pose -1 is the static world, whose points are in world axes.
+    # Written out, because numba's `@` calls scipy's BLAS, and streets don't need scipy otherwise.
     for i in range(3):
         for j in range(4):
             if pose < 0:
@@ -184,20 +184,21 @@ def _cross(p, q):
 
 @_compiled
 def _fill(p, q, r, near_m, far_m, triangle, inverse, number):
-    # Edge functions: the planes through the camera and the edges opposite p, q and r. The corners
-    # are counter-clockwise to the eye, which with v downwards is clockwise in (u, v): hence r × q
-    # and not q × r, so that visible triangles have det > 0 and positive edge functions inside.
+    # p, q and r [3] are the corners z · (u, v, 1). e, f and g [3] are the edge functions: the
+    # planes through the camera and the edges opposite p, q and r. Seen from outside, corners are
+    # counter-clockwise, but v points downwards, so they are clockwise in (u, v). Therefore r × q
+    # and not q × r: visible triangles then have det > 0 and positive edge functions inside.
     e, f, g = _cross(r, q), _cross(p, r), _cross(q, p)
     det = p[0] * e[0] + p[1] * e[1] + p[2] * e[2]
     if det <= 0.0:
-        return  # facing away, or edge-on
+        return  # the triangle faces away or is seen edge-on
     height, width = inverse.shape
-    # The pixels to look at: the bounds of the corners' pixels, if all are in front of the camera.
-    # A corner behind it has no pixel; then edges alone decide, over the whole picture.
+    # The range of pixels to visit: the bounding box of the corners, if all are beyond the near
+    # plane. A corner behind the camera has no pixel; then it is the whole picture.
     x0, x1, y0, y1 = 0.0, width - 1.0, 0.0, height - 1.0
     nearest = min(p[2], q[2], r[2])
     if nearest >= near_m:
-        # det / (z_p z_q z_r) is twice the area in pixels.
+        # det / (z_p z_q z_r) is twice the area of the triangle in pixels.
         if det <= _LEAST_AREA_PX * (p[2] * q[2] * r[2]):
             return
         i, j, k = 1.0 / p[2], 1.0 / q[2], 1.0 / r[2]
@@ -206,16 +207,17 @@ def _fill(p, q, r, near_m, far_m, triangle, inverse, number):
         y0 = max(y0, math.ceil(min(p[1] * i, q[1] * j, r[1] * k)))
         y1 = min(y1, math.floor(max(p[1] * i, q[1] * j, r[1] * k)))
     elif max(p[2], q[2], r[2]) < near_m:
-        return  # all of it is nearer than the near plane
+        return  # the whole triangle is nearer than the near plane
     if x0 > x1 or y0 > y1:
         return
     most = 1.0 / near_m
-    # Inverse depth, affine in the pixel's index: base + dx · x + dy · y.
+    # Inverse depth at pixel (x, y) is base + dx · x + dy · y.
     dx, dy = (e[0] + f[0] + g[0]) / det, (e[1] + f[1] + g[1]) / det
     base = (e[2] + f[2] + g[2]) / det
     for y in range(int(y0), int(y1) + 1):
-        # Of each row the columns in which all three edge functions are >= 0: an edge bounds them on
-        # the left or on the right by the sign of its slope in x, so no pixel is tested for itself.
+        # Find the columns low to high in which all three edge functions e_x · x + rest are >= 0. By
+        # the sign of e_x, an edge bounds them on the left or on the right. This way, pixels need no
+        # test of their own.
         low, high = x0, x1
         for edge in (e, f, g):
             rest = edge[1] * y + edge[2]
@@ -223,14 +225,15 @@ def _fill(p, q, r, near_m, far_m, triangle, inverse, number):
                 low = max(low, math.ceil(-rest / edge[0]))
             elif edge[0] < 0.0:
                 high = min(high, math.floor(-rest / edge[0]))
-            elif rest < 0.0:  # the edge is level and the row outside of it
+            elif rest < 0.0:  # the edge is horizontal, and the row lies outside of it
                 high = -1.0
         if low > high:
             continue
         row = base + dy * y
         for x in range(int(low), int(high) + 1):
             w = row + dx * x
-            # Nearer than what is drawn there, at first the far plane, but not than the near plane.
+            # Draw the pixel if it is nearer than the surface there (at first, the far plane), but
+            # not nearer than the near plane.
             if inverse[y, x] < w <= most:
                 inverse[y, x] = w
                 number[y, x] = triangle
@@ -251,13 +254,13 @@ def _look_up(inverse, number, classes, instances, depth, semantic, instance):
 
 @_shading
 def _shade(inverse, number, K, cam_from_world, world_from_body, look, rgb):
-    # Paint times grain times light, filtered to a pixel's size, once all triangles are drawn. A row
-    # consists of runs of pixels of one triangle. `_find_texels` goes through a run first, so that
-    # the compiler can use vector instructions, which the look-ups after it rule out.
+    # Colours are paint times grain times light, filtered to the size of a pixel. A row consists of
+    # runs of pixels of one triangle. For each run, `_find_texels` first computes all texel
+    # positions: in a separate loop, because the look-ups afterwards can't use vector instructions.
     poses, normals, colours, contrast, grain_axes, front_of, front_axes, grain, fronts = look
     height, width = number.shape
     moving = len(world_from_body)
-    cam_from_body = np.empty((moving + 1, 3, 4))  # the last, for pose -1, is the world's
+    cam_from_body = np.empty((moving + 1, 3, 4))  # the last one is cam_from_world, for pose -1
     for k in range(-1, moving):
         _compose(cam_from_world, world_from_body, k, cam_from_body[k])
     lx, ly, lz = _turned(cam_from_body, -1, LIGHT[0], LIGHT[1], LIGHT[2])
@@ -348,12 +351,12 @@ def _seen_from_cam(axes, t, cam_from_body, k, into):
 def _find_texels(count, axes, a, b, du, dv, w, wu, wv, is_front, us, vs, levels):
     """Writes the texels on a run of rays, and the level whose texels have a pixel's size.
 
-    The first ray is (a, b, 1), the first inverse depth w; du, dv, wu and wv are what a pixel to the
-    right or further down adds. Levels of house fronts are to be rounded, those of the grain, which
-    blends two, are not.
+    The first ray is (a, b, 1), with inverse depth w. du and dv are the steps of a and b, wu and wv
+    those of w, for one pixel to the right and down. Levels are rounded for house fronts, but not
+    for the grain, which blends two levels.
     """
-    # All in float32, of which a vector register holds 16. Three arrays are written, no more: LLVM
-    # checks each pair for overlaps, and with a fourth it gives up and leaves the loop scalar.
+    # All values are float32, of which a vector register holds 16. LLVM checks each pair of written
+    # arrays for overlaps; with more than these three it gives up and leaves the loop scalar.
     s0 = np.float32(axes[0, 0] * a + axes[0, 1] * b + axes[0, 2])
     t0 = np.float32(axes[1, 0] * a + axes[1, 1] * b + axes[1, 2])
     s_u, t_u = np.float32(axes[0, 0] * du), np.float32(axes[1, 0] * du)
@@ -366,8 +369,8 @@ def _find_texels(count, axes, a, b, du, dv, w, wu, wv, is_front, us, vs, levels)
         step = np.float32(np.int32(i))
         z = np.float32(1.0) / (w + step * wu)
         s, t = s0 + step * s_u, t0 + step * t_u
-        # How many texels the point on the surface moves for a pixel to the right or further down:
-        # d(z r)/du = z (e_x / fx - r w_u / w), and likewise for v. The longer one decides the
+        # How many texels the point on the surface moves for one pixel to the right or down:
+        # d(z r)/du = z (e_x / fx - r w_u / w), and likewise for v. The larger one determines the
         # level.
         su, tu = s_u - s * z * wu, t_u - t * z * wu
         sv, tv = s_v - s * z * wv, t_v - t * z * wv
@@ -382,11 +385,11 @@ def _find_texels(count, axes, a, b, du, dv, w, wu, wv, is_front, us, vs, levels)
 def _around(u, v, level, size, half):
     """Returns columns and rows of the four texels around (u, v), and the weights between them.
 
-    The last value is the part of `level` after the point, the weight of the next level. The centre
-    of texel 0 is at `half`.
+    The last value is the fractional part of `level`, the weight of the next level. The centre of
+    texel 0 is at `half`.
     """
     n = np.uint32(level)
-    # Unsigned, since numba has to check signed indices for being negative. Sizes are powers of two,
+    # Unsigned, because numba checks whether signed indices are negative. Sizes are powers of two,
     # so that `& (side - one)` repeats the pattern.
     side, one = size >> n, np.uint32(1)
     scale = np.float32(side) / np.float32(size)

@@ -1,4 +1,4 @@
-"""A laid-out scene as bodies in the simulator, visible to the camera and solid to the vehicle."""
+"""A scene as bodies in the simulator, which the camera sees and the vehicle can hit."""
 
 import math
 import pickle
@@ -21,15 +21,15 @@ from flowrep.simulator.paint import texture
 
 Array = NDArray[Any]
 _TWO_LANES_M = 5.0  # narrower roads have no lane marks
-_HIDDEN_M = -1000.0  # height of bodies that are not there, out of reach of camera and vehicle
+_HIDDEN_M = -1000.0  # height of absent bodies, out of reach of camera and vehicle
 _SAFE_CELL_M = 0.25  # side of a cell of the table below
 _BOXES_A_BODY = 16  # PyBullet's limit for one compound shape
 
 
 class SafeGround:
-    """A table of where a vehicle is certainly clear of edges, boxes and end zones.
+    """A table of the places where a vehicle is certainly clear of edges, boxes and end zones.
 
-    Elsewhere the exact and slower tests of PyBullet and shapely decide, as they do near people.
+    Elsewhere, and near people, the exact but slower tests of PyBullet and shapely decide.
     """
 
     def __init__(self, layout: Layout) -> None:
@@ -44,7 +44,7 @@ class SafeGround:
         y = np.arange(self._y0, y1, _SAFE_CELL_M) + _SAFE_CELL_M / 2
         shapely.prepare(safe)
         table = shapely.contains_xy(safe, *np.meshgrid(x, y, indexing="ij"))
-        # As bytes, whose elements Python looks up in half the time of an array's.
+        # Stored as bytes, because Python reads their elements in half the time of an array's.
         self._columns = [column.astype(np.uint8).tobytes() for column in table]
 
     def __call__(self, x_m: float, y_m: float) -> bool:
@@ -65,7 +65,7 @@ class Street:
         self._numbers: list[int] = []  # PyBullet's, of the bodies
         vehicle, count = layout.scene.vehicle, layout.scene.num_pedestrians
         self._vehicle = self.simulator.add_box(vehicle.length_m, vehicle.width_m, vehicle.height_m)
-        # One cylinder for all people: it is placed wherever the vehicle may touch a person.
+        # A single cylinder serves all people: it is placed wherever the vehicle may touch a person.
         self._person = self.simulator.add_cylinder(pedestrians.RADIUS_M, pedestrians.HEIGHT_M)
         self._boxes: list[tuple[Box, int]] = []  # all that can be hit, each with its body
         self._add_ground(layout)
@@ -87,8 +87,9 @@ class Street:
 
     @classmethod
     def shared(cls, scene: Scene) -> "Street":
-        """Returns the street that all environments of this process with this scene share."""
-        # A PyBullet client takes 28 MB. Pickled, since a scene holds mappings and has no hash.
+        """Returns the street that all envs of this process with this scene share."""
+        # A PyBullet client takes 28 MB. The key is pickled, because a scene contains mappings and
+        # has no hash.
         key = pickle.dumps(scene)
         street = _STREETS.get(key)
         if street is None:
@@ -96,7 +97,7 @@ class Street:
         return street
 
     def ids_by_number(self) -> NDArray[np.uint8]:
-        """Returns class and instance [N, 2] by PyBullet's number; the last, -1, is the sky."""
+        """Returns class and instance [N, 2] by PyBullet's number; the last row, -1, is the sky."""
         ids = np.zeros((max(self._numbers) + 2, 2), dtype=np.uint8)
         ids[self._numbers] = [(body.semantic, body.instance) for body in self.bodies]
         return ids
@@ -123,7 +124,7 @@ class Street:
             self.simulator.place_at(part, position, rotation)
 
     def is_anyone_near(self, track: Sequence[VehicleState], poses: Array) -> Array:
-        """Returns at which of T times anyone, at poses [T, P, 4], is near enough to be touched."""
+        """Returns at which of T times a person, at poses [T, P, 4], is near enough to be touched."""
         centres = np.array([state[:2] for state in track])
         gaps = poses[..., :2] - centres[:, None]
         return ((gaps * gaps).sum(axis=-1) <= self._person_reach_m**2).any(axis=-1)

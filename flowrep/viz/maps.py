@@ -47,14 +47,14 @@ OUTCOME_COLOURS = {
 """Colour of each outcome in every figure, safe for colour-blind readers (Okabe and Ito)."""
 
 _UNKNOWN = (128, 128, 128)
-# Near to far, like matplotlib's magma_r, which isn't used so that pictures need no matplotlib; the
-# dark end is next to the black of "no surface".
+# Near to far, as in matplotlib's magma_r, but without the need for matplotlib. The dark end is next
+# to the black that means no surface.
 _DEPTH_COLOURS = np.array(
     [(252, 253, 191), (254, 176, 120), (241, 96, 93), (183, 55, 121), (104, 28, 129), (40, 16, 80)],
     dtype=np.float32,
 )
-# What a hue at full saturation subtracts from white, tabulated by direction [_HUES, 3]. In HSV at
-# full value, each channel is a trapezoid over hue, and the three are a third of a turn apart.
+# What a fully saturated hue subtracts from white, by direction [_HUES, 3]. In HSV at full value,
+# each channel is a trapezoid over hue, and the three channels are a third of a turn apart.
 _HUES = 6 * 4096
 _OFF_WHITE = 255 * (
     1 - np.clip(np.abs((6 * np.arange(_HUES)[:, None] / _HUES + (0, 4, 2)) % 6 - 3) - 1, 0, 1)
@@ -63,7 +63,7 @@ _BAR_PX = 28
 _NOTE_PX = 20
 _CLASS_PX = 120
 _GAP_PX = 4
-_GAP_GREY = 200  # so that the white of no motion has an edge
+_GAP_GREY = 200  # between images, so that the white of no motion has a visible edge
 _FRAME_PX, _FRAME_COLOUR = 5, (230, 97, 1)
 _NOTE_COLOUR = (70, 70, 70)
 _TILE_PX = 240

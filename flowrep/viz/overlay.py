@@ -1,4 +1,4 @@
-"""What a film adds to its maps: the steering, how the episode ends, and a legend."""
+"""What a film shows besides maps: the steering, the outcome of the episode, and a legend."""
 
 from __future__ import annotations
 

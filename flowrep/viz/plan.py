@@ -43,7 +43,7 @@ def draw_plan(layout: Layout, tracks: Iterable[Track] = (), *, path: str | None 
 
     The closures of `path` are drawn in full; if it is None, all are drawn faintly.
     """
-    # As wide as what stands there, and as high as the same metres need, within a page.
+    # As wide as the scene, and as high as the same scale needs, within the size of a page.
     standing = [box.footprint for box in (*layout.buildings, *layout.obstacles)]
     shown = shapely.union_all([layout.drivable, layout.sidewalks, *standing])
     x0, y0, x1, y1 = shown.buffer(_MARGIN_M).bounds
@@ -125,7 +125,8 @@ def _draw_zones(axes: Axes, layout: Layout) -> list[Any]:
             named.add(name)
             zone = next(zone for zone in scene.zones if zone.name == name)
             x, y, heading = layout.pose_at(zone.road, (zone.from_m + zone.to_m) / 2)
-            # Starts are named to the left of the road, ends to its right: a zone may be both.
+            # Starts are named to the left of the road and ends to its right, because a zone may be
+            # both.
             reach = _LABEL_PT if name in starts else -_LABEL_PT
             aside = -reach * math.sin(heading), reach * math.cos(heading)
             box = {"boxstyle": "round,pad=0.2", "facecolor": "white", "alpha": 0.85, "lw": 0}

@@ -1,4 +1,4 @@
-"""Videos: an mp4 exists once it is complete, never in part."""
+"""Videos; an mp4 gets its name only when it is complete."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ class Video:
     The file gets its name when it is complete. Odd sizes, which the codec does not support, are
     padded with a white row or column. Frames of other sizes than the first are cut or padded.
 
-    It starts FFmpeg itself, since imageio's writer ignores its exit status, and thus a full disk.
+    It starts FFmpeg itself, because imageio's writer ignores FFmpeg's exit status, and so a full
+    disk.
 
     Raises:
         OSError: FFmpeg can't write the file; the message names it.
