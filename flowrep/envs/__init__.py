@@ -1,9 +1,9 @@
-"""Streets with pedestrians in PyBullet: gymnasium environments and `make_env` for TorchRL.
+"""Streets with pedestrians in PyBullet: gymnasium envs and `make_env` for TorchRL.
 
-Importing this registers them with gymnasium, which from 1.0 on finds no plugins by itself.
+Importing this module registers the envs with gymnasium, which since 1.0 finds no plugins by itself.
 `gymnasium.make("flowrep.envs:flowrep/StraightRoad-v0")` imports it first.
 
-Names that need PyTorch are imported on first use: worker processes step environments without it.
+Names that need PyTorch are imported on first use, because worker processes step envs without it.
 """
 
 from importlib import import_module
@@ -37,7 +37,7 @@ SCENE_BY_ID = {
     "flowrep/HShapedPathways-v0": "h_shaped_pathways",
     "flowrep/ThreeWayJunction-v0": "three_way_junction",
 }
-"""The scene of each environment that is registered with gymnasium."""
+"""The scene of each env that is registered with gymnasium."""
 
 for _id, _scene in SCENE_BY_ID.items():
     gymnasium.register(

@@ -33,7 +33,7 @@ class Outcome(IntEnum):
         return self.name.lower()
 
 
-NOTHING_HIT = 255  # the code of `hit` without a collision; no class has this id
+NOTHING_HIT = 255  # value of `hit` without a collision; no class has this id
 
 
 def reward(outcome: Outcome) -> float:
@@ -47,22 +47,23 @@ def hit_name(code: int) -> str:
 
 
 Array = NDArray[Any]
-# Between two checks of the footprint neither the vehicle nor a person moves more than 0.42 m (the
-# vehicle at 10 m/s), nor a shorter vehicle more than its length, so it can't jump over anything.
+# Between two tests of the footprint, neither the vehicle nor a person moves more than 0.42 m (the
+# vehicle at 10 m/s), and a shorter vehicle not more than its length. So it can't jump over
+# anything.
 _CHECKS_HZ = 24.0
 _CHECKS_PER_M = 2.4
 _STEPS_AHEAD = 16  # people ignore the vehicle, so their poses are computed for many steps at once
 
 
 class Moment(NamedTuple):
-    """The vehicle's state and the pedestrians' clock, in ticks: checks of the footprint."""
+    """The vehicle's state and the pedestrians' clock in ticks; each tick tests the footprint."""
 
     vehicle: VehicleState
     ticks: int
 
 
 def ticks_for(scene: Scene, frame_rate_hz: float, speed_mps: Range, driven_mps: float) -> int:
-    """Returns how many times a step checks the footprint, at the speeds of an episode."""
+    """Returns how many times a step tests the footprint, at the speeds of an episode."""
     groups = [group for group in scene.pedestrian_groups if group.standing < group.count]
     fastest_mps = max(((group.speed_mps or speed_mps)[1] for group in groups), default=0.0)
     driven_hz = driven_mps * max(_CHECKS_PER_M, 1.0 / scene.vehicle.length_m)
@@ -75,8 +76,8 @@ class Episode:
 
     Args:
         frame_rate_hz: steps a second.
-        episode_seed: of all that is drawn: the path, and people's walks.
-        speed_mps: lowest and highest speed of people whose group has none of its own.
+        episode_seed: seed of everything that is drawn: the path, and how people walk.
+        speed_mps: lowest and highest speed of people whose group doesn't set its speed.
         path: the name of the path; None draws one.
 
     Raises:
@@ -96,9 +97,9 @@ class Episode:
         paths = {each.name: each for each in scene.paths}
         if path is not None and path not in paths:
             raise ValueError(f"unknown path {path!r}; the scene has {[*paths]}")
-        # The order of the draws is part of what a seed means: first the path, then the people.
+        # A seed's episode depends on the order of the draws: first the path, then the people.
         rng = np.random.default_rng(episode_seed)
-        # Drawn even if a path is given, so that a seed has the same people on every path.
+        # Draw even if a path is given, so that a seed has the same people on every path.
         drawn = scene.paths[int(rng.integers(len(scene.paths)))]
         self.layout, self.seed = layout, episode_seed
         self.speed_mps, self.vehicle_speed_mps = speed_mps, vehicle_speed_mps
@@ -113,7 +114,7 @@ class Episode:
         self.now = self.before = Moment(layout.start_state(self.path.start), 0)
         self.steps, self.outcome, self.hit = 0, Outcome.RUNNING, ""
         self.poses = self.poses_before = self.crowd.poses(0.0)
-        # Poses of people at some ticks in a row, [ticks, P, 4], and the first of these ticks.
+        # Poses of people at consecutive ticks, [ticks, P, 4], and the first of these ticks.
         self._ahead_from, self._ahead = 0, self.poses[:0, None]
 
     def status(self) -> dict[str, int]:
@@ -133,15 +134,15 @@ class Episode:
 
     def step(self, action: int, street: Street) -> None:
         """Drives one step, or part of it if the episode ends."""
-        # The yaw rate changes once, at the beginning; then the vehicle rolls along one arc, on
-        # which the footprint is checked at every tick.
+        # The yaw rate changes once, at the beginning. Then the vehicle drives along an arc, on
+        # which the footprint is tested at every tick.
         turned = turn(self.now.vehicle, YAW_SIGN[action], self.dt_s, self.layout.scene.vehicle)
         times_s = [(1 + i) * self.tick_s for i in range(self.ticks_per_step)]
         track = [roll(turned, time_s, self.vehicle_speed_mps) for time_s in times_s]
         poses = self._poses_ahead()
         is_near = street.is_anyone_near(track, poses).tolist()
         for i, vehicle in enumerate(track):
-            # PyBullet and shapely are asked only where a collision or an end is possible.
+            # Call PyBullet and shapely only where a collision or an end is possible.
             if is_near[i] or not street.is_safe(vehicle.x_m, vehicle.y_m):
                 self._end_where_due(vehicle, poses[i], street)
             if self.outcome:

@@ -1,4 +1,4 @@
-"""Representations as plain numpy maps, for gymnasium learners without TorchRL."""
+"""Representations as numpy maps, for gymnasium users without TorchRL."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -24,7 +24,7 @@ Maps = NDArray[Any] | dict[str, NDArray[Any]]
 
 
 class RepresentationObservation(gym.Wrapper):
-    """Turns an environment's sensor maps into representations, channels first and finite.
+    """Replaces the sensor maps of an env by representations, channels first and finite.
 
     If joined, the observation is one `Box` `[C, H, W]`: float32, with the representations' channels
     in the given order, ids one-hot and colours divided by 255; rgb alone stays uint8. If not
@@ -37,8 +37,8 @@ class RepresentationObservation(gym.Wrapper):
         num_classes: the number of semantic classes; the env's `num_classes` by default.
 
     Raises:
-        ValueError: the observation is no dict, or a representation needs what neither the env nor
-            an argument gives.
+        ValueError: the observation is not a dict, or a representation needs something that neither
+            the env nor an argument gives.
 
     >>> env = gym.make("flowrep/StraightRoad-v0", representations=["ego", "obj"])
     >>> observation, info = env.reset(seed=0)
@@ -74,7 +74,7 @@ class RepresentationObservation(gym.Wrapper):
     ) -> tuple[Maps, dict[str, Any]]:
         """Begins an episode."""
         observation, info = self.env.reset(seed=seed, options=options)
-        # TorchRL's entry points of a transform, called as its TransformedEnv calls them.
+        # These are the methods of a transform that TorchRL's TransformedEnv calls.
         sensed = _sensed(observation)
         self._now = self._stack._reset(sensed, sensed)
         return self._maps(), info
@@ -105,11 +105,11 @@ class NumericInfo(gym.Wrapper):
     """Replaces `info` by numbers, and optionally reports time-outs as truncations.
 
     `outcome` is a code of `Outcome`, `hit` a class id or 255, `path` an index into the scene's
-    paths; `is_success` is what Stable-Baselines3 reads.
+    paths; `is_success` is for Stable-Baselines3.
 
     Args:
         env: a `StreetEnv`, wrapped or not.
-        truncate_timeouts: whether a time-out is `truncated`, not `terminated`.
+        truncate_timeouts: whether a time-out is `truncated` instead of `terminated`.
     """
 
     def __init__(self, env: gym.Env, *, truncate_timeouts: bool = False) -> None:
@@ -144,7 +144,7 @@ def make_street(
     truncate_timeouts: bool = False,
     **options: Any,
 ) -> gym.Env:
-    """Returns a `StreetEnv`, wrapped if it should give representations; for `gymnasium.make`.
+    """Returns a `StreetEnv` for `gymnasium.make`, wrapped if representations are given.
 
     Args:
         representations: as for `RepresentationObservation`; without any, observations are the
@@ -155,7 +155,8 @@ def make_street(
         options: further arguments of `StreetEnv`.
     """
     if representations and "sensors" not in options:
-        # Which sensors are read doesn't depend on K and the number of classes.
+        # K and the number of classes are arbitrary here: the sensors that are read don't depend on
+        # them.
         any_camera: dict[str, Any] = {"intrinsics": torch.eye(3), "num_classes": 1}
         options["sensors"] = sensors_read(representation_stack(representations, **any_camera))
     env: gym.Env = StreetEnv(scene, **options)
@@ -167,7 +168,7 @@ def make_street(
 
 
 def _onehot(representations: Representations) -> dict[str, Any]:
-    """Returns the representations with one-hot ids, as a class id is no intensity."""
+    """Returns the representations with one-hot ids, because a class id is not an intensity."""
     options: dict[str, Any] = dict.fromkeys(representations)
     if isinstance(representations, Mapping):
         options |= representations

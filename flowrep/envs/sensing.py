@@ -1,4 +1,4 @@
-"""What a street's camera senses: maps, and the motion of bodies and camera since the last step."""
+"""What a street's camera observes: maps, and motions of camera and bodies since the last step."""
 
 from collections.abc import Sequence, Set
 from typing import Any
@@ -27,13 +27,13 @@ _DRAWN = _MAPS | {"rgb"}
 class Sensing:
     """The camera of a street and the requested sensors; it draws any number of episodes at once.
 
-    It holds nothing of an episode. All environments of a process with the same street and options
-    can therefore share one, see `shared`.
+    It has no state of an episode, so all envs of a process with the same street and options can
+    share one, see `shared`.
     """
 
     @classmethod
     def shared(cls, street: Street, sensors: Sequence[str], renderer: str, scale: int) -> "Sensing":
-        """Returns the one that all environments of the process with these options share."""
+        """Returns the one that all envs of the process with these options share."""
         key = street, tuple(sensors), renderer, scale
         sensing = _SHARED.get(key)
         if sensing is None:
@@ -66,7 +66,7 @@ class Sensing:
         return {name: stack[0] for name, stack in self.observe_all([episode]).items()}
 
     def observe_all(self, episodes: Sequence[Episode]) -> Arrays:
-        """Returns the current observations of N episodes, [N, ...], equal to each one alone."""
+        """Returns the current observations of N episodes, [N, ...], as `observe` returns each."""
         names = _DRAWN.intersection(self.names)
         observation = self._draw(episodes, names) if names else {}
         if not {"prev_from_curr", "instance_motion"}.isdisjoint(self.names):
@@ -75,7 +75,7 @@ class Sensing:
             if "instance_motion" in self.names:
                 parts_before = world_from_parts(np.stack([e.poses_before for e in episodes]))
                 parts = world_from_parts(np.stack([e.poses for e in episodes]))
-                # Composed in float64, rounded once. Row 0 is copied, as a view would have gaps.
+                # Composed in float64 and rounded once. Row 0 is copied, so that it is contiguous.
                 rows = instance_motion(before, now, parts_before, parts).astype(np.float32)
                 observation |= {"instance_motion": rows, "prev_from_curr": rows[:, 0].copy()}
             else:
@@ -90,7 +90,7 @@ class Sensing:
         return self._draw([episode], {"rgb"})["rgb"][0].transpose(1, 2, 0)
 
     def look(self, episode: Episode) -> Picture:
-        """Returns PyBullet's picture from an episode's camera, of the bodies as last placed."""
+        """Returns PyBullet's picture from an episode's camera, of bodies as last placed."""
         view = camera.gl_view(rigid_inverse(self._camera_poses([episode.now])[0]))
         return self._street.simulator.look(view, self._projection, *self._size)
 
@@ -124,7 +124,7 @@ class Sensing:
         return arrays
 
     def views(self, episodes: Sequence[Episode]) -> tuple[Array, Array, Array]:
-        """Returns cam_from_world, people's parts, and which bodies are there, of N episodes."""
+        """Returns cam_from_world, the poses of people's parts, and which bodies exist, [N, ...]."""
         return (
             rigid_inverse(self._camera_poses([episode.now for episode in episodes])),
             world_from_parts(np.stack([episode.poses for episode in episodes])),
@@ -137,13 +137,13 @@ class Sensing:
             from flowrep.simulator.rasteriser import Rasteriser  # which imports numba
 
             height, width = self._size
-            # Pixel centres at halves scale like all other coordinates.
+            # All rows of K scale alike, because pixel centres are at halves.
             K, size = np.diag([scale, scale, 1.0]) @ self.K, (scale * height, scale * width)
             self._rasterisers[scale] = Rasteriser(self._street.triangles, K, size, self._range_m)
         return self._rasterisers[scale]
 
     def _pictured(self, episode: Episode) -> Arrays:
-        # All environments share one PyBullet world: people and exits are placed for each picture.
+        # All envs share one PyBullet world, so people and exits are placed for each picture.
         self._street.close_exits(episode.path.closures)
         self._street.place_pedestrians(episode.poses)
         picture = self.look(episode)

@@ -1,4 +1,4 @@
-"""The gymnasium environment."""
+"""The gymnasium env of a street."""
 
 import math
 import operator
@@ -20,7 +20,7 @@ _OPTIONS = ("episode_seed", "path", "vehicle_speed_mps", "speed", "frame_rate_hz
 
 
 class StreetEnv(gym.Env):
-    """A vehicle is steered at constant speed through a street with pedestrians.
+    """The agent steers a vehicle at constant speed through a street with pedestrians.
 
     Actions: 0 keeps the yaw rate, 1 adds α·Δt to it (left), 2 subtracts α·Δt (right).
 
@@ -89,9 +89,9 @@ class StreetEnv(gym.Env):
 
     @property
     def episode(self) -> Episode:
-        """The current episode with every pose, for privileged policies."""
+        """The current episode, which knows every pose, for privileged policies."""
         if self._episode is None:
-            raise RuntimeError("no episode has begun: call reset() first")
+            raise RuntimeError("there is no episode yet: call reset() first")
         return self._episode
 
     def reset(
@@ -103,16 +103,17 @@ class StreetEnv(gym.Env):
             seed: seeds the generator that draws the episodes' seeds.
             options: `episode_seed` (int) selects the episode and `path` (str) its path;
                 `vehicle_speed_mps` (float) replaces the scene's speed, 0 for a still camera;
-                `speed` and `frame_rate_hz` replace the env's for this episode. Or `state` alone, of
-                `get_state`, which resumes an episode.
+                `speed` and `frame_rate_hz` replace the env's for this episode. `state`, from
+                `get_state`, resumes an episode and excludes the others.
         """
         self.begin(seed=seed, options=options)
         return self.sensing.observe(self.episode), self._info()
 
-    # `begin` and `drive` leave out the observation, so that `StreetVectorEnv` draws all at once.
+    # `begin` and `drive` return no observation, because `StreetVectorEnv` draws all of them at
+    # once.
 
     def begin(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
-        """Begins an episode as `reset` does, without an observation."""
+        """Begins an episode like `reset`, without an observation."""
         super().reset(seed=seed)
         options = options or {}
         if "state" in options:
@@ -121,13 +122,13 @@ class StreetEnv(gym.Env):
             self._begin({"episode_seed": int(self.np_random.integers(1 << 31))} | options)
 
     def step(self, action: int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Drives one step; every end of an episode is `terminated`, the time-out included."""
+        """Drives one step; every end of an episode is `terminated`, also a time-out."""
         outcome = self.drive(action)
         observation = self.sensing.observe(self.episode)
         return observation, reward(outcome), outcome != Outcome.RUNNING, False, self._info()
 
     def drive(self, action: int) -> Outcome:
-        """Drives one step as `step` does, without an observation."""
+        """Drives one step like `step`, without an observation."""
         episode = self.episode
         if action not in range(len(YAW_SIGN)):
             raise ValueError(
@@ -143,7 +144,7 @@ class StreetEnv(gym.Env):
         return None if self.render_mode is None else self.sensing.rgb(self.episode)
 
     def close(self) -> None:
-        """Releases the street; its simulator closes with the last environment that uses it."""
+        """Releases the street; its simulator closes with the last env that uses it."""
         self.sensing = self._street = None  # type: ignore[assignment]
 
     def get_state(self) -> dict[str, Any]:
@@ -212,7 +213,7 @@ def _speed_range(scene: Scene, speed: SpeedMode | Range) -> Range:
 
 
 def checked_frame_rate(scene: Scene, frame_rate_hz: float | None) -> float:
-    """Returns a frame rate in 1/s, the scene's own for None; ValueError if it is out of range."""
+    """Returns a frame rate in 1/s, the scene's for None; ValueError if it is out of range."""
     rate = scene.frame_rate_hz if frame_rate_hz is None else float(frame_rate_hz)
     lowest, highest = FRAME_RATES_HZ
     if not lowest <= rate <= highest:

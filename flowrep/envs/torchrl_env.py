@@ -1,4 +1,4 @@
-"""TorchRL environments of streets, with the transforms that write representations."""
+"""TorchRL envs of streets, with the transforms that write representations."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
@@ -31,7 +31,7 @@ def usable_device(device: str | torch.device) -> torch.device:
     """
     try:
         return torch.empty(0, device=device).device
-    except (RuntimeError, AssertionError) as error:  # the latter of a PyTorch without CUDA
+    except (RuntimeError, AssertionError) as error:  # AssertionError: a PyTorch without CUDA
         reason = str(error).splitlines()[0]
         raise ValueError(f"device={device} can't be used: {reason}. Try device=cpu") from None
 
@@ -57,7 +57,7 @@ class VectorWrapper(GymWrapper):
 
     def _replace_reset(self, reset: Tensor | None, kwargs: dict[str, Any]) -> dict[str, Any]:
         # TorchRL 0.14 passes masks on from the TensorDict's device, which fails on CUDA, and
-        # requires them in every TensorDict; here, all environments are reset if they are missing.
+        # requires them in every TensorDict; here, all envs are reset if they are missing.
         if reset is None:
             return kwargs
         mask = {"reset_mask": reset.view(self.batch_size).cpu().numpy()}
@@ -86,8 +86,8 @@ def make_env(
 
     It reads `action` (categorical: 0 keep the yaw rate, 1 turn left, 2 turn right) and writes the
     representations, `outcome` and `hit` uint8 [1], `episode_seed` and `path` int64 [1], `vehicle`
-    float32 [3] (see `StreetVectorEnv`), `reward` [1] and the done keys. Which episodes an env gets,
-    and in which order, depends on its seed alone, not on the policy.
+    float32 [3] (see `StreetVectorEnv`), `reward` [1] and the done keys. The episodes of an env and
+    their order depend only on its seed, not on the policy.
 
     Args:
         scene: a scene's name, YAML file, mapping, or `Scene`.
@@ -97,24 +97,24 @@ def make_env(
         num_envs: the batch size.
         num_workers: number of processes that step the envs, see `WorkerVectorEnv`; 0 steps them in
             this process. The results are the same.
-        device: of the TensorDicts; streets are simulated on the CPU.
+        device: device of the TensorDicts; streets are simulated on the CPU.
         speed: see `StreetEnv`, as for `frame_rate_hz`, `renderer` and `picture_scale`.
-        seed: of the envs, which draw their episodes from it; None leaves that to `set_seed`.
+        seed: the seed from which the envs draw their episodes; with None, call `set_seed`.
         keep_sensor: whether to keep the ("sensor", ...) keys; rgb and frame are kept only if a
             representation needs them.
         flow: "exact" or "estimated", the source of raw and obj; a mapping gives options, see
             `flowrep.transforms.representation_stack`.
-        motion: "exact" or "estimated" from flow and depth, the source of the camera's motion behind
-            ego and obj.
-        noise: errors of the depth camera and of odometry, see `representation_stack`; the same
-            whenever an episode is repeated.
-        compiled: whether flow is computed through `torch.compile`: up to two and a half times as
-            fast on a CPU and equal up to rounding, after up to a minute of compilation.
+        motion: the source of the camera's motion for ego and obj: "exact", or "estimated" from flow
+            and depth.
+        noise: errors of a depth camera and of odometry, see `representation_stack`; a repeated
+            episode has the same noise.
+        compiled: whether flow is computed by `torch.compile`: up to two and a half times as fast on
+            a CPU and equal up to rounding, after up to a minute of compilation.
 
     Raises:
         SceneError: the scene is invalid.
-        ValueError: an argument is invalid, the device can't be used, or `compiled=True` without a
-            C++ compiler.
+        ValueError: an argument is invalid, the device can't be used, or there is no C++ compiler
+            for `compiled=True`.
 
     >>> env = make_env("straight_road", ["ego", "obj"], num_envs=2, seed=0)
     >>> env.rollout(3)["next", "obj"].shape
@@ -122,10 +122,10 @@ def make_env(
     >>> env.close()
     """
     if num_envs < 1:
-        raise ValueError(f"num_envs is {num_envs}; give at least one environment")
+        raise ValueError(f"num_envs is {num_envs}; give at least one env")
     device = usable_device(device)
     loaded = load_scene(scene)
-    # The estimator needs pictures of its scale, whatever the env was asked for.
+    # The estimator determines the scale of the pictures, whatever `picture_scale` is.
     if isinstance(flow, Mapping):
         picture_scale = flow.get("picture_scale", picture_scale)
     drawn: Any = {"renderer": choose_renderer(renderer), "picture_scale": picture_scale}
@@ -166,10 +166,10 @@ def make_env(
 def make_mirror(
     scene: str | Path | Mapping[str, Any] | Scene, representations: Iterable[str]
 ) -> Mirror:
-    """Returns the transform that replaces half of a replay batch by its left-right images.
+    """Returns the transform that replaces half of a replay batch by mirror images.
 
     Args:
-        scene: as for `make_env`; its camera determines which columns see opposite directions.
+        scene: as for `make_env`; its camera determines which columns mirror each other.
         representations: the keys of the maps, as in `make_env`.
 
     >>> make_mirror("straight_road", ["ego", "seg2"]).swapped_actions
@@ -182,14 +182,14 @@ def make_mirror(
 
 
 def begin_step(env: TransformedEnv, acted: TensorDictBase) -> None:
-    """Starts `env.step(acted)` in the workers of an env; does nothing without workers."""
+    """Starts `env.step(acted)` in the env's workers; does nothing without workers."""
     vector = _vector(env)
     if vector.num_workers:
         vector.step_async(env.base_env.read_action(acted[env.action_key]))
 
 
 def has_spare_cores(env: TransformedEnv, threads: int) -> bool:
-    """Returns whether the env's workers and `threads` threads of the caller have a core each."""
+    """Returns whether there is a core for each of the env's workers and `threads` own threads."""
     # If not, running both at once takes longer than one after the other: threads synchronise at
     # every operation, and all of them wait when one loses its core.
     return _vector(env).num_workers + threads <= available_cores()
@@ -199,16 +199,16 @@ def street_envs(env: TransformedEnv) -> list[StreetEnv]:
     """Returns the `StreetEnv`s of an env made by `make_env`, in the order of its batch.
 
     Raises:
-        ValueError: the environments are in worker processes.
+        ValueError: the envs are in worker processes.
     """
     vector = _vector(env)
     if vector.num_workers:
-        raise ValueError("the environments are in worker processes: give num_workers=0")
+        raise ValueError("the envs are in worker processes: give num_workers=0")
     return [street.unwrapped for street in vector.envs]
 
 
 def get_states(env: TransformedEnv) -> list[dict[str, Any]]:
-    """Returns the state of every environment as JSON-serialisable data."""
+    """Returns the state of every env as JSON-serialisable data."""
     return list(_vector(env).call("get_state"))
 
 
@@ -216,11 +216,11 @@ def set_states(env: TransformedEnv, states: Sequence[Mapping[str, Any]]) -> None
     """Restores states from `get_states`; continue with the TensorDict of the same step.
 
     Raises:
-        ValueError: there isn't one state for each environment.
+        ValueError: there isn't one state for each env.
     """
     vector = _vector(env)
     if len(states) != (count := vector.num_envs):
-        raise ValueError(f"{len(states)} states for {count} environments; give one for each")
+        raise ValueError(f"{len(states)} states for {count} envs; give one for each")
     env.reset()
     vector.reset(options={"episodes": [{"state": state} for state in states]})
 

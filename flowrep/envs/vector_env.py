@@ -1,4 +1,4 @@
-"""Environments of one scene in one process, stepped one by one and rendered together."""
+"""Envs of one scene in one process, stepped one by one and rendered together."""
 
 from collections.abc import Callable, Sequence
 from copy import deepcopy
@@ -24,9 +24,9 @@ _STATUS: dict[str, Any] = {
 
 
 class StreetVectorEnv(SyncVectorEnv):
-    """`StreetEnv`s that are drawn together; the status of their episodes is in the observation.
+    """`StreetEnv`s that are drawn together; the observation contains the status of their episodes.
 
-    Without autoreset.
+    There is no autoreset.
 
     | key | shape | dtype | meaning |
     | --- | --- | --- | --- |
@@ -37,10 +37,10 @@ class StreetVectorEnv(SyncVectorEnv):
     | `path` | [1] | int64 | index of the episode's path in the scene |
     | `vehicle` | [3] | float32 | x and y in metres and yaw in radians, in the world |
 
-    Observations are bitwise equal to those of the environments alone, and belong to the caller.
+    Observations are bitwise equal to those of the single envs. Later steps don't change them.
 
     Raises:
-        ValueError: the environments differ in scene, sensors, renderer or `picture_scale`.
+        ValueError: the envs differ in scene, sensors, renderer or `picture_scale`.
     """
 
     num_workers = 0
@@ -66,12 +66,12 @@ class StreetVectorEnv(SyncVectorEnv):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begins episodes in all environments, or in those marked by `options["reset_mask"]`.
+        """Begins episodes in all envs, or in those marked by `options["reset_mask"]`.
 
         Args:
-            seed: of the first environment, with consecutive seeds for the others; or one for each.
-            options: of every episode, see `StreetEnv.reset`. `episodes` holds further options for
-                each environment, or None to leave it idle until its next reset: it then ignores
+            seed: the seed of the first env, with consecutive seeds for the others; or one for each.
+            options: for every episode, see `StreetEnv.reset`. `episodes` holds further options for
+                each env, or None to leave it idle until its next reset. An idle env ignores
                 actions, gets no reward, and keeps its last observation.
         """
         options = dict(options or {})
@@ -89,7 +89,7 @@ class StreetVectorEnv(SyncVectorEnv):
     def step(
         self, actions: NDArray[Any]
     ) -> tuple[dict[str, Any], NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """Steps all environments that are not idle."""
+        """Steps all envs that are not idle."""
         rewards, ended = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=bool)
         driven = [i for i in range(self.num_envs) if not self._is_idle[i]]
         for i in driven:
@@ -98,19 +98,19 @@ class StreetVectorEnv(SyncVectorEnv):
         return self._observe(driven), rewards, ended, np.zeros_like(ended), {}
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Closes the environments; a street's simulator closes with its last one."""
+        """Closes the envs; a street's simulator closes with its last env."""
         super().close_extras(**kwargs)
         del self._sensing
 
     def _observe(self, rows: list[int]) -> dict[str, Any]:
-        """Renders some environments; the others keep their last observation, at first zeros."""
+        """Renders some envs; the others keep their last observation, which is 0 at first."""
         if not rows:
             return deepcopy(self._latest)
         episodes = [self._streets[row].episode for row in rows]
         sensor = self._sensing.observe_all(episodes)
         observation = ({"sensor": sensor} if sensor else {}) | _status(episodes)
         if len(rows) < self.num_envs:
-            # The arrays belong to the caller of an earlier step: copy them before writing to them.
+            # The caller may still use the arrays of an earlier step: copy them before writing.
             self._latest = deepcopy(self._latest)
             copy_into_rows(observation, self._latest, rows)
         else:

@@ -1,4 +1,4 @@
-"""Environments stepped in parallel by several processes, several environments in each."""
+"""Envs stepped in parallel by several processes, several envs in each."""
 
 import os
 import pickle
@@ -33,34 +33,34 @@ _SIDE_BY_SIDE = partial(SyncVectorEnv, copy=False, autoreset_mode=AutoresetMode.
 
 PATIENCE_S, PATIENCE_AFTER_STOP_S = 300.0, 10.0
 """How long a worker may take to answer. It starts in seconds and steps in milliseconds, but the
-machine may be busy. After a signal to stop there is less time: SIGKILL may follow soon."""
+machine may be busy. After a signal to stop the limit is shorter: SIGKILL may follow soon."""
 
 
 class WorkerError(RuntimeError):
-    """A worker process failed, died or doesn't answer; the message names its environments."""
+    """A worker process failed, died or doesn't answer; the message names its envs."""
 
 
 class WorkerVectorEnv(VectorEnv):
-    """Several environments in each of several processes, behind gymnasium's vector interface.
+    """Several envs in each of several processes, behind gymnasium's vector interface.
 
     It behaves like a `SyncVectorEnv` with autoreset disabled: the same seeds and actions give the
     same numbers, bit for bit, for any number of workers. Infos are not passed on.
 
-    Gymnasium's `AsyncVectorEnv` has a process for each environment. It stepped 386 to 403 frames/s
-    where this one stepped 464 to 524, and Ctrl-C kills its workers.
+    Gymnasium's `AsyncVectorEnv` has one process per env. It reached 386 to 403 frames/s where this
+    class reached 464 to 524, and Ctrl-C kills its workers.
 
     Observations come back through shared memory, everything else through pipes. Workers ignore
     SIGINT, SIGTERM and SIGHUP, which terminals and schedulers send to whole process groups. They
     end when the caller closes them or dies.
 
     Args:
-        env_factories: one picklable factory for each environment, from a module that can be
-            imported; all environments have the same spaces, with a `Dict` of observations.
-        num_workers: number of processes, at most one for each environment.
-        in_each: makes a vector env without autoreset from the environments of one worker.
+        env_factories: one picklable factory for each env, from a module that can be imported; all
+            envs have the same spaces, with a `Dict` of observations.
+        num_workers: number of processes, at most one for each env.
+        in_each: makes a vector env without autoreset from the envs of one worker.
 
     Raises:
-        ValueError: there are more workers than environments, or a factory can't be pickled.
+        ValueError: there are more workers than envs, or a factory can't be pickled.
         WorkerError: a worker could not start; any method raises it if a worker has ended or does
             not answer.
     """
@@ -85,16 +85,16 @@ class WorkerVectorEnv(VectorEnv):
         example.close()
         self.observation_space = batch_space(space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._begun: NDArray[Any] | None = None  # the actions of a step that is under way
-        # Rows of the batch by worker, as evenly as possible: 2, 1 and 2 of 5 in 3 workers.
+        self._begun: NDArray[Any] | None = None  # the actions of a step that has begun
+        # Each worker's rows of the batch, as even as possible: 5 envs in 3 workers are 2, 1 and 2.
         bounds = np.linspace(0, self.num_envs, num_workers + 1).round().astype(int).tolist()
         self._rows = [slice(*ends) for ends in pairwise(bounds)]
         self._workers: list[_Worker] = []
-        # At exit, multiprocessing sends SIGTERM and waits. Workers ignore it, so they are closed
-        # before.
+        # At exit, multiprocessing sends SIGTERM and waits. Workers ignore SIGTERM, so close them
+        # before that.
         self._end = util.Finalize(self, _end, args=(self._workers,), exitpriority=10)
-        # fork would copy the locks that PyTorch's threads hold at the moment. spawn would import
-        # gymnasium, numpy and PyBullet in each worker; a fork server imports them once.
+        # fork would copy the locks that PyTorch's threads hold. spawn would import gymnasium, numpy
+        # and PyBullet in each worker; a fork server imports them once.
         context: Any = get_context("forkserver")
         context.set_forkserver_preload(["flowrep.envs.vector_env"])
         with sheltered():
@@ -106,7 +106,7 @@ class WorkerVectorEnv(VectorEnv):
                     self._workers.append(_Worker(context, rows, *arguments))
                 except (pickle.PicklingError, AttributeError, TypeError) as error:
                     raise ValueError(
-                        f"an environment's factory can't be sent to a worker process ({error}): "
+                        f"the factory of an env can't be sent to a worker process ({error}): "
                         "define it at the top of a module that can be imported, not in the script "
                         "that is run, or step it in this process"
                     ) from error
@@ -120,7 +120,7 @@ class WorkerVectorEnv(VectorEnv):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Arrays, dict[str, Any]]:
-        """Begins episodes as `SyncVectorEnv` does; the outcome of a step under way is dropped.
+        """Begins episodes like `SyncVectorEnv`; drops the outcome of a step that has begun.
 
         The options `reset_mask`, bool [num_envs], and `episodes`, see `StreetVectorEnv.reset`, are
         split among the workers; all others go to each.
@@ -141,7 +141,7 @@ class WorkerVectorEnv(VectorEnv):
     def step_async(self, actions: NDArray[Any]) -> None:
         """Begins a step; `step` with the same actions waits for it and returns its outcome."""
         if self._begun is not None:
-            raise RuntimeError("a step is under way: call step() for its outcome first")
+            raise RuntimeError("a step has begun: call step() for its outcome first")
         actions = np.array(actions)
         self._send("step", lambda rows: {"actions": actions[rows]})
         self._begun = actions
@@ -149,19 +149,20 @@ class WorkerVectorEnv(VectorEnv):
     def step(
         self, actions: NDArray[Any]
     ) -> tuple[Arrays, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """Takes a step, or returns the outcome of the one that `step_async` began."""
+        """Takes a step, or returns the outcome of the step that `step_async` began."""
         if self._begun is None:
             self.step_async(actions)
         elif not np.array_equal(self._begun, actions):
             raise ValueError(f"step_async began a step with {self._begun}, step got {actions}")
         self._begun = None
-        # Workers write observations into shared memory, where the next step overwrites them.
+        # Copy, because workers write observations into shared memory, where the next step
+        # overwrites them.
         outcomes = [worker.receive()[:3] for worker in self._workers]
         rewards, terminated, truncated = map(np.concatenate, zip(*outcomes))
         return deepcopy(self._shared), rewards, terminated, truncated, {}
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Returns the result of a method, or the value of an attribute, for each environment."""
+        """Returns the result of a method, or the value of an attribute, for each env."""
         results = self._call("call", lambda rows: {"name": name, "args": args, "kwargs": kwargs})
         return tuple(result for of_worker in results for result in of_worker)
 
@@ -182,7 +183,7 @@ class WorkerVectorEnv(VectorEnv):
 
 
 class _Worker:
-    """The caller's side of a process that steps environments."""
+    """The main process's side of a process that steps envs."""
 
     def __init__(self, context: Any, rows: slice, *arguments: Any) -> None:
         self.name = f"environments {rows.start} to {rows.stop - 1}"
@@ -190,10 +191,10 @@ class _Worker:
         self.process = context.Process(target=_work, args=(theirs, rows, *arguments), daemon=True)
         self.process.start()
         theirs.close()
-        self._owes_answer = True  # once its environments exist
+        self._owes_answer = True  # it answers once its envs exist
 
     def send(self, method: str, arguments: dict[str, Any]) -> None:
-        if self._owes_answer:  # of a step that was dropped, or of a call that was interrupted
+        if self._owes_answer:  # to a step that was dropped, or to a call that was interrupted
             self.receive()
         self._talk(self.pipe.send, (method, arguments))
         self._owes_answer = True
@@ -263,22 +264,22 @@ def _work(
             if method == "call":
                 result = vector.call(arguments["name"], *arguments["args"], **arguments["kwargs"])
             elif method == "reset" and not arguments["options"]["reset_mask"].any():
-                result = ()  # which gymnasium's vector env refuses
+                result = ()  # gymnasium's vector env refuses this call
             else:
                 observation, *result = getattr(vector, method)(**arguments)
                 copy_into_rows(observation, shared, rows)
             pipe.send((result, None))
     except (EOFError, BrokenPipeError, ConnectionResetError):
-        pass  # the caller has closed, or is gone
+        pass  # the main process has closed the pipe, or is gone
     except Exception:
         pipe.send((None, traceback.format_exc()))
     finally:
-        if vector is not None:  # its environments may have failed to build
+        if vector is not None:  # building its envs may have failed
             vector.close()
 
 
 def copy_into_rows(source: Mapping[str, Any], target: Mapping[str, Any], rows: Any) -> None:
-    """Copies arrays nested in mappings into some rows of those in `target`."""
+    """Copies arrays that are nested in mappings into some rows of those in `target`."""
     for name, value in source.items():
         if isinstance(value, Mapping):
             copy_into_rows(value, target[name], rows)
@@ -289,9 +290,8 @@ def copy_into_rows(source: Mapping[str, Any], target: Mapping[str, Any], rows: A
 @contextmanager
 def sheltered() -> Iterator[None]:
     """Starts processes with signals blocked, and keeps them from running the main module again."""
-    # A process inherits the mask of blocked signals. If it blocked them itself, Ctrl-C in the
-    # moment before would print a traceback from each worker, or end multiprocessing's resource
-    # tracker.
+    # A process inherits the mask of blocked signals. If it blocked them itself, Ctrl-C just before
+    # that would print a traceback from each worker, or end multiprocessing's resource tracker.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     resource_tracker.ensure_running()  # which unblocks some of them when it starts
     signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)

@@ -124,7 +124,7 @@ class Street:
             self.simulator.place_at(part, position, rotation)
 
     def is_anyone_near(self, track: Sequence[VehicleState], poses: Array) -> Array:
-        """Returns at which of T times a person, at poses [T, P, 4], is near enough to be touched."""
+        """Returns at which of T times a person, at poses [T, P, 4], is within touching distance."""
         centres = np.array([state[:2] for state in track])
         gaps = poses[..., :2] - centres[:, None]
         return ((gaps * gaps).sum(axis=-1) <= self._person_reach_m**2).any(axis=-1)
