@@ -28,11 +28,11 @@ _RIGID, _SOFT = 1, 3  # what getDynamicsInfo returns as a body's type has no nam
 
 
 class BulletCamera:
-    """A camera in a PyBullet world: what it sees, and how all that it sees has moved.
+    """A camera in a PyBullet world: its maps, and the motions of the camera and of all bodies.
 
-    Each call takes one picture and returns the sensor keys as numpy arrays, which
-    `TensorDict(sensor=camera())` takes as they are. Call it once a step, and `reset` at the first
-    frame of an episode.
+    Each call takes one picture and returns the sensor keys as numpy arrays, ready for
+    `TensorDict(sensor=camera())`. Call it once per step, and call `reset` at the first frame of an
+    episode.
 
     | key | shape | |
     | --- | --- | --- |
@@ -43,11 +43,12 @@ class BulletCamera:
     | `semantic`, with `classes` | uint8 `[1, H, W]` | |
     | `rgb`, with `rgb=True` | uint8 `[3, H, W]` | |
 
-    A body keeps its row while it exists. The motion of one that wasn't there at the last call is
-    nan, as is that of a soft body, so that their flow is unknown. Links move as they are drawn:
-    `getLinkState` is a substep behind, and with `computeForwardKinematics` would change what the
-    env reads next. To tell a body from one that later gets its number, each is marked once with
-    PyBullet's `addUserData`; nothing else in the world changes.
+    A body keeps its row while it exists. The motion of a body that didn't exist at the last call is
+    nan, like that of a soft body, so that its flow is unknown. The poses of links are those at
+    which they are drawn: `getLinkState` lags one substep behind, and with
+    `computeForwardKinematics` it would change what the env reads next. Each body is marked once
+    with PyBullet's `addUserData`, to distinguish it from another body that gets its number later;
+    nothing else in the world changes.
 
     Args:
         client: a `BulletClient`, the number of a client, or the module `pybullet`.
@@ -58,15 +59,15 @@ class BulletCamera:
         near_m: with `fov_deg`, the near plane, by default 0.05.
         far_m: with `fov_deg`, the far plane, beyond which nothing is drawn, by default 100.
         view: the 16 numbers of `computeViewMatrix`, or a function that returns them at each call.
-            Without it, each call needs one.
-        link: (body, link) that the camera rides on, link -1 for the base. `view` is then in the
-            axes of the URDF's link; without it, the camera looks along their z and y is down.
-        instances: `"links"`, or `"bodies"` for one row a body, which must have no moving joints.
-        max_instances: the number of rows for bodies and links that exist at once.
+            Without it, each call needs a view.
+        link: (body, link) on which the camera is mounted, link -1 for the base. `view` is then in
+            the axes of the URDF's link; without it, the camera looks along z, and y is down.
+        instances: `"links"`, or `"bodies"` for one row per body, which must have no moving joints.
+        max_instances: the number of rows for bodies and links that exist at the same time.
         classes: class ids by body; other bodies, and the sky, are 0.
         rgb: whether to return the picture.
-        renderer: PyBullet's constant. K is that of the renderer that draws in fact: without EGL's
-            plugin or a window, the software renderer does, whatever is asked for.
+        renderer: PyBullet's constant. Without EGL's plugin or a window, PyBullet uses the software
+            renderer whatever you choose. K is that of the renderer in use.
         picture: further arguments of `getCameraImage`, such as `lightDirection` or `shadow`.
 
     Attributes:
@@ -74,8 +75,8 @@ class BulletCamera:
         rows: rows of `instance_motion` by (body, link); a body's base is link -1.
 
     Raises:
-        ValueError: arguments that don't fit together, a world of more than `max_instances`, or a
-            `link` that doesn't exist.
+        ValueError: arguments don't fit together, the world has more than `max_instances` bodies and
+            links, or `link` doesn't exist.
 
     Example:
         >>> client = pybullet.connect(pybullet.DIRECT)
@@ -141,7 +142,7 @@ class BulletCamera:
         self._row_of: dict[tuple[str, int], int] = {}  # by tag and link
 
     def reset(self, view: View | None = None) -> dict[str, Array]:
-        """Returns the sensor keys of an episode's first frame: nothing has moved yet."""
+        """Returns the sensor keys of an episode's first frame, at which nothing has moved."""
         self._before, self._row_of = None, {}
         return self(view)
 
@@ -149,7 +150,7 @@ class BulletCamera:
         """Returns the sensor keys of this step.
 
         Args:
-            view: the camera's view now, instead of the constructor's.
+            view: the camera's current view, instead of the constructor's.
         """
         bodies = self._existing()
         poses = {tag: body.poses(self._client) for tag, body in bodies.items()}  # [1 + links, 4, 4]
@@ -209,11 +210,11 @@ class BulletCamera:
         return K, (float(near_m), float(far_m))
 
     def _existing(self) -> dict[str, _Body]:
-        """Returns the bodies that exist now, by the tag that each keeps while it exists."""
+        """Returns the bodies that exist now, by the tag that a body keeps while it exists."""
         client, bodies = self._client, {}
         for number in map(client.getBodyUniqueId, range(client.getNumBodies())):
             key = client.getUserDataId(number, _TAG)
-            if key < 0:  # a new body, which may have the number of one that was removed
+            if key < 0:  # a new body, perhaps with the number of a removed one
                 key = client.addUserData(number, _TAG, uuid.uuid4().hex)
             tag = client.getUserData(key).decode()
             bodies[tag] = self._bodies.get(tag) or _Body(client, number)
@@ -226,10 +227,10 @@ class BulletCamera:
         return bodies
 
     def _rows(self, poses: Mapping[str, Array]) -> dict[tuple[str, int], int]:
-        """Returns the row of each instance: as it was, or a free one for a new instance."""
+        """Returns the row of each instance: the same as before, or a free one if it is new."""
         present = [(tag, link - 1) for tag, pose in poses.items() for link in range(len(pose))]
-        # The row of one that left stays empty for a step, so that a row is never of one body in
-        # this frame and of another in the frame before.
+        # When an instance disappears, its row stays empty for a step, so that a row never has one
+        # body in this frame and another in the previous frame.
         taken = set(self._row_of.values())
         free = (row for row in range(1, 1 + self.max_instances) if row not in taken)
         row_of = {each: self._row_of.get(each) or next(free, 0) for each in present}
@@ -249,7 +250,7 @@ class BulletCamera:
             view = self._view() if callable(self._view) else self._view
         if self._link is None:
             if view is None:
-                raise ValueError("the camera has no view: give it to BulletCamera or to each call")
+                raise ValueError("the camera has no view: give one to BulletCamera or to each call")
             return pose_of_view(view)
         body, link = self._link
         for tag, each in bodies.items():
@@ -309,14 +310,15 @@ class BulletCamera:
 class BulletFlow(gym.Wrapper):
     """Adds a camera's sensor keys to the observations of a gymnasium env on PyBullet.
 
-    They are under `"sensor"`, beside the entries of a dict of observations, or beside
+    They are under `"sensor"`, next to the entries of a dict of observations, or next to
     `"observation"` if the env returns an array. At a reset nothing has moved.
 
     Args:
-        env: on PyBullet.
+        env: an env on PyBullet.
         camera: a function that takes `env.unwrapped` and returns its `BulletCamera`. It is called
-            after each reset, since some envs connect or load their robot anew in theirs, and once
-            after a reset here. Or a `BulletCamera`, of a world that lasts.
+            after each reset, because some envs connect or load their robot again at a reset, and
+            once in the constructor, after a reset. If the env keeps its world, it may also be a
+            `BulletCamera`.
 
     Attributes:
         camera: the `BulletCamera`.
@@ -374,7 +376,7 @@ class BulletFlow(gym.Wrapper):
 
 
 class _Client:
-    """PyBullet's functions, for a client of which there is only the number."""
+    """PyBullet's functions for a client that is given by its number."""
 
     def __init__(self, number: int) -> None:
         self._number = number
@@ -384,10 +386,10 @@ class _Client:
 
 
 class _Body:
-    """A body: what doesn't change while it exists, and the poses of its base and links.
+    """A body: its constants, and the current poses of its base and links.
 
-    Poses are those of the centres of mass, as `getBasePositionAndOrientation` gives them. Those of
-    links follow from the joints' positions, the forward kinematics that Bullet draws.
+    Poses are those of the centres of mass, as `getBasePositionAndOrientation` returns them. Those
+    of links follow from the joints' positions by forward kinematics, as Bullet draws them.
     """
 
     def __init__(self, client: Any, number: int) -> None:
@@ -408,17 +410,16 @@ class _Body:
         self.joints = [link for link in links if infos[link][2] != pybullet.JOINT_FIXED]
         inertial = [base[3:5], *(state[2:4] for state in states)]
         self.mass_from_link = rigid_inverse(_transforms(*zip(*inertial)))
-        # Bullet's own joints: axis and frame have the axes of the link's inertia, the rotation
-        # leads from the parent to the link, and the centre of mass is where the link's origin,
-        # which is the joint, was moved from.
+        # In Bullet, a joint is at the origin of its link. Its axis and frame have the axes of the
+        # link's inertia, and its rotation leads from the parent to the link.
         turned = _transforms([(0.0, 0.0, 0.0)] * len(infos), [info[15] for info in infos])
         self.parent_from_joint = rigid_inverse(turned)
         self.parent_from_joint[:, :3, 3] = np.array([i[14] for i in infos]).reshape(-1, 3)
         self.joint_from_mass = np.tile(np.eye(4), (len(infos), 1, 1))
         self.joint_from_mass[:, :3, 3] = -self.mass_from_link[1:, :3, 3]
         self.axes = np.array([info[13] for info in infos], dtype=np.float64).reshape(-1, 3)
-        # Bullet turns about axes of any length, MJCF's (2, 1, 1) for instance, and slides along
-        # them by that length.
+        # Axes may have any length, for instance (2, 1, 1) in MJCF. Bullet normalises it when it
+        # turns, but slides by multiples of it.
         x, y, z = (self.axes / np.linalg.norm(self.axes, axis=1, keepdims=True).clip(1e-12)).T
         o = np.zeros_like(x)
         self.cross = np.stack([o, -z, y, z, o, -x, -y, x, o], -1).reshape(-1, 3, 3)
@@ -454,7 +455,7 @@ class _Body:
                 quaternion = client.getJointStateMultiDof(self.number, link)[0]
                 moved[link] = _transforms([(0.0, 0.0, 0.0)], [quaternion])[0]
             elif self.types[link] not in (pybullet.JOINT_REVOLUTE, pybullet.JOINT_PRISMATIC):
-                moved[link] = np.nan  # a planar joint, say: its flow is unknown
+                moved[link] = np.nan  # another joint, such as a planar one: unknown flow
         return moved
 
 
@@ -476,8 +477,9 @@ def _transforms(positions: Sequence[View], quaternions_xyzw: Sequence[View]) -> 
 def _software_draws(client: Any, renderer: int) -> bool:
     """Returns whether the software renderer draws this client's pictures.
 
-    PyBullet doesn't say: EGL's plugin replaces that renderer without a trace. But OpenGL's buffer
-    is exactly 1 in the sky, and the software renderer's is rounded for most near and far planes.
+    PyBullet doesn't say so, because EGL's plugin replaces that renderer silently. But OpenGL's
+    buffer is exactly 1 in the sky, while the software renderer's has rounding errors for most near
+    and far planes.
     """
     up = pybullet.computeViewMatrix([0, 0, 1e6], [0, 0, 2e6], [0, 1, 0])
     for near_m, far_m in ((0.1, 20.0), (0.02, 20.0), (0.1, 100.0), (0.1, 3.0)):

@@ -1,4 +1,4 @@
-"""Networks and algorithms, built from specs and keys alone; they know no environment."""
+"""Networks and algorithms, built from specs and keys alone; they never see an env."""
 
 from flowrep.extras import require
 

@@ -18,11 +18,11 @@ from flowrep.agent.networks import DiscreteActions, acting_network, stochastic_p
 from flowrep.options import AlgorithmOptions
 
 Step = Callable[[TensorDictBase], TensorDictBase]
-WARM_UP = 3  # eager steps, which create Adam's moments and TorchRL's caches
+WARM_UP = 3  # eager updates before the graph is captured; they create Adam's moments and caches
 
 
 class Algorithm(ABC):
-    """Acts with `policy`, stores frames in `memory` and takes gradient steps on samples from it.
+    """Acts with `policy`, stores frames in `memory` and takes updates on samples from it.
 
     ```
     acted = algorithm.act(observation)                      # writes `action`
@@ -39,9 +39,9 @@ class Algorithm(ABC):
 
     Args:
         loss: its parameters are trained, its target parameters follow them.
-        learning_rate: Adam's, falling linearly to 0 over `total_updates`.
-        total_updates: gradient steps over the whole training.
-        tau: share of the online weights in each move of the targets; None without targets.
+        learning_rate: of Adam; it falls linearly to 0 over `total_updates`.
+        total_updates: number of updates of the whole training.
+        tau: weight of the online weights in each update of the targets; None without targets.
         max_grad_norm: the norm over all gradients is scaled down to this maximum.
     """
 
@@ -76,7 +76,7 @@ class Algorithm(ABC):
     ) -> None:
         self.loss = loss
         if tau is not None:
-            SoftUpdate(loss, tau=tau)  # tells TorchRL that something moves the targets
+            SoftUpdate(loss, tau=tau)  # keeps TorchRL from warning that nothing moves the targets
         self.tau = tau
         self.weights = weights_of(loss) | dict(self.other_weights())
         targets = [name for name in self.weights if name.startswith("target_")]
@@ -94,7 +94,7 @@ class Algorithm(ABC):
         losses = [name for name in self.METRICS if name.endswith("_loss")]
         others = [name for name in self.METRICS if name not in losses]
         self.divergence = DivergenceWatch([*losses, "grad_norm"], others, self.device)
-        # the fused optimizer skips its step if this is 1, which it reads on the device
+        # The fused optimizer skips its step if this is 1; it reads the value on the device.
         self.optimizer.found_inf = self.divergence.is_bad  # type: ignore[attr-defined]
         self.updates = 0
         self._is_eager = not self.CAPTURABLE
@@ -104,7 +104,7 @@ class Algorithm(ABC):
         groups: dict[float, dict[str, Any]] = {}
         for name, weight in self.trained.items():
             factor = rate_factors.get(name, 1.0)
-            # a tensor, so that a captured step reads its current value
+            # A tensor, so that a captured step reads its current value.
             rate = torch.tensor(self.learning_rate * factor, device=self.device)
             group = groups.setdefault(factor, {"params": [], "factor": factor, "lr": rate})
             group["params"].append(weight)
@@ -139,7 +139,7 @@ class Algorithm(ABC):
         return stochastic_policy(network, list(keys), actions, writes_log_prob=cls.WRITES_LOG_PROB)
 
     def step_eagerly(self) -> None:
-        """Runs all further updates eagerly, not as a CUDA graph, for debugging and timing."""
+        """Runs all further updates eagerly instead of as a CUDA graph, for debugging and timing."""
         self._is_eager = True
         self._capture()
 
@@ -153,11 +153,11 @@ class Algorithm(ABC):
         return (*cls.METRICS, "grad_norm", "learning_rate")
 
     def act(self, observation: TensorDictBase) -> TensorDictBase:
-        """Returns an observation of N environments with the actions that collect experience."""
+        """Adds `action`, as taken in training, to an observation of N envs, and returns it."""
         return self.policy(observation)
 
     def remember(self, steps: TensorDictBase) -> None:
-        """Stores steps of N environments: observations, actions and their outcomes."""
+        """Stores steps of N envs: observations, actions, rewards and next observations."""
         self.memory.extend(steps)
 
     @abstractmethod
@@ -185,11 +185,11 @@ class Algorithm(ABC):
         """Moves the targets by `tau` towards the weights; called after each optimizer step."""
         if self.tau is not None:
             with torch.no_grad():
-                # one call for all weights, where SoftUpdate's step makes some for each
+                # One call for all weights; SoftUpdate's step has several for each weight.
                 torch._foreach_lerp_(self._targets, self._followed, self.tau)
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Takes one gradient step on a batch from `sample()` and returns detached metrics.
+        """Takes one update on a batch from `sample()` and returns detached metrics.
 
         Once a loss or a gradient is nan or infinite, the weights no longer change and
         `divergence.check()` raises.
@@ -232,10 +232,10 @@ class Algorithm(ABC):
 
     @torch.no_grad()
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a `state_dict`, also if this agent has since learnt more or diverged.
+        """Restores a `state_dict`, also into an agent that has learnt more since then or diverged.
 
         Raises:
-            ValueError: if it was saved by another algorithm, or for other maps or sizes.
+            ValueError: if another algorithm saved it, or it is for other maps or sizes.
         """
         saved = state["weights"]
         here, there = ({n: tuple(w.shape) for n, w in x.items()} for x in (self.weights, saved))
@@ -245,11 +245,11 @@ class Algorithm(ABC):
             raise ValueError(
                 f"the saved agent does not fit this one in {len(differing)} weights, first "
                 f"{first}: {here.get(first, 'absent')} here, {there.get(first, 'absent')} there; "
-                "use the algorithm, representations, image size and encoder it was made with"
+                "use the algorithm, representations, picture size and encoder it was made with"
             )
         for name, weight in self.weights.items():
             weight.copy_(saved[name])
-        self.optimizer.state.clear()  # a state of no updates has no moments
+        self.optimizer.state.clear()  # a state without updates has no moments
         for name, moments in state["moments"].items():
             own = {key: value.to(self.device, copy=True) for key, value in moments.items()}
             self.optimizer.state[self.trained[name]] = own
@@ -259,7 +259,7 @@ class Algorithm(ABC):
 
 
 def weights_of(loss: LossModule) -> dict[str, Tensor]:
-    """Returns a loss's parameters and target parameters by name, the encoders' first."""
+    """Returns a loss's parameters and target parameters by name, those of the encoders first."""
     targets = {n: w for n, w in loss.named_buffers() if n.startswith("target_") and "_params." in n}
     weights = dict(loss.named_parameters()) | targets
     encoders = [name for name in weights if "encoder" in name.partition(".")[0]]
@@ -271,9 +271,9 @@ class DivergenceError(ArithmeticError):
 
 
 class DivergenceWatch:
-    """Keeps, on the device, the metrics of the first update with a `watched` one that isn't finite.
+    """Keeps, on the device, the metrics of the first update in which a `watched` one isn't finite.
 
-    Its tensors change in place, so that a CUDA graph can record.
+    Its tensors change in place, so that it works within a CUDA graph.
     """
 
     def __init__(
@@ -285,7 +285,7 @@ class DivergenceWatch:
         self.is_bad = torch.zeros((), device=device)  # 1.0 from the first bad update on
 
     def reset(self, good_updates: int = 0) -> None:
-        """Forgets what it has seen; the next update follows `good_updates` others."""
+        """Forgets all metrics; `good_updates` is the number of updates so far."""
         self._values.zero_()
         self._good_updates.fill_(good_updates)
         self.is_bad.zero_()
@@ -324,10 +324,11 @@ def as_cuda_graph(step: Step, device: torch.device) -> Step:
 
 
 def of_one_shape(step: Step) -> Step:
-    """Returns `step` with a check that batches have the layout of the first one.
+    """Returns `step` with a check that each batch has the layout of the first one.
 
-    A graph copies each batch into the first one's memory. Without the check, a batch of one row
-    would silently be broadcast, numbers be cast and a missing map keep its old values.
+    A graph copies each batch into the memory of the first one. Without the check, a batch of one
+    row would silently be broadcast, numbers would be cast, and a missing map would keep its old
+    values.
     """
     first: dict[Any, tuple[Any, ...]] = {}
 
@@ -335,7 +336,7 @@ def of_one_shape(step: Step) -> Step:
         items = batch.items(include_nested=True, leaves_only=True)
         layout = {key: (tuple(value.shape), value.dtype) for key, value in items}
         first.update(() if first else layout)
-        # only the first batch's keys count: a loss may add its own to a batch that is reused
+        # Compare only the keys of the first batch: a loss may add keys to a batch that is reused.
         for key, expected in first.items():
             if layout.get(key) != expected:
                 raise ValueError(

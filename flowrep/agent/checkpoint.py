@@ -5,10 +5,10 @@ nested state, with each tensor as `{"tensor": name}` and each dict as `{"dict": 
 it can run code. `torchrl.checkpoint` loses the last checkpoint if it is killed between its two
 renames, see docs/upstream.md.
 
-The metadata also hold a CRC-32 of each part, a key of the outermost dict, so that an agent is
-checked without reading a replay memory of gigabytes. It notices every change of up to 32 bits in a
-row and all but one in 2³² of others. Cryptographic digests take 3 to 5 times as long and would not
-protect from somebody who writes checkpoints: they would write the digest, too.
+The metadata also hold a CRC-32 of each part (a key of the outermost dict), so that an agent can be
+checked without reading a replay memory of gigabytes. A CRC-32 detects every change of up to 32
+consecutive bits, and of other changes all but one in 2³². Cryptographic digests take 3 to 5 times
+as long. They would not protect from an attacker, who would write the digest, too.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ def save_checkpoint(path: str | os.PathLike[str], state: Mapping[str, Any]) -> N
             any depth. Tuples come back as lists.
 
     Raises:
-        TypeError: if `state` holds anything else; the message names the place.
-        CheckpointError: if it can't be written (disk full, read-only). A previous file stays.
+        TypeError: if `state` holds anything else; the message names the key.
+        CheckpointError: if it can't be written (disk full, read-only). A previous file is kept.
     """
     path = Path(path)
     tensors: dict[str, Tensor] = {}
@@ -70,7 +70,7 @@ def save_checkpoint(path: str | os.PathLike[str], state: Mapping[str, Any]) -> N
 def _write(tensors: dict[str, Tensor], metadata: dict[str, str], path: Path) -> None:
     try:
         save_file(tensors, path, metadata=metadata)
-    except SafetensorError as error:  # of the disk, with an errno only in its text
+    except SafetensorError as error:  # an error of the disk; the errno is only in its text
         code = re.search(r"(?:os error |code: )(\d+)", str(error))
         number = int(code[1]) if code else errno.EIO
         raise OSError(number, os.strerror(number)) from error
@@ -121,7 +121,7 @@ def load_checkpoint(
 
 
 def _as_json(value: Any, place: str, tensors: dict[str, Tensor]) -> Any:
-    """Returns `value` as JSON data and adds its tensors to `tensors`, named by place and number."""
+    """Returns `value` as JSON data and adds its tensors to `tensors`, under unique names."""
     if isinstance(value, Tensor):
         tensor = value.detach().cpu().contiguous()
         memory = tensor.untyped_storage().data_ptr()
@@ -143,7 +143,7 @@ def _as_json(value: Any, place: str, tensors: dict[str, Tensor]) -> Any:
 
 
 def _read(part: Any, get_tensor: Callable[[str], Tensor]) -> tuple[Any, int]:
-    """Returns what a part's JSON data stand for, and the CRC-32 of these and of its tensors."""
+    """Returns the state of a part, and the CRC-32 of its JSON data and tensors."""
     tensors: list[Tensor] = []
 
     def get(name: str) -> Tensor:
@@ -159,7 +159,7 @@ def _read(part: Any, get_tensor: Callable[[str], Tensor]) -> tuple[Any, int]:
 
 
 def _from_json(value: Any, get_tensor: Callable[[str], Tensor]) -> Any:
-    """Undoes `_as_json`."""
+    """Inverts `_as_json`."""
     if isinstance(value, list):
         return [_from_json(item, get_tensor) for item in value]
     if not isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""Settings of the process that make gradient steps on a CPU faster."""
+"""Settings of the process that make updates on a CPU faster."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ _THRESHOLD_BYTES = 1 << 30
 
 
 def keep_freed_memory() -> bool:
-    """Tells glibc to reuse large freed blocks; returns whether this C library is glibc and did.
+    """Makes glibc reuse large freed blocks; returns whether that worked (False without glibc).
 
-    Call it once and early, as blocks already allocated are not moved.
+    Call it once and early, because it doesn't affect blocks that are already allocated.
     """
-    # By default glibc maps every block above a threshold (32 MiB at most) afresh and unmaps it when
+    # By default, glibc maps every block above a threshold (32 MiB at most) and unmaps it when
     # freed, so the kernel zeroes each activation of a large batch page by page in every update.
-    # With both thresholds at 1 GiB the blocks stay in the heap.
+    # With both thresholds at 1 GiB, the blocks stay in the heap.
     if platform.libc_ver()[0] != "glibc":
         return False
     mallopt = ctypes.CDLL(None).mallopt
@@ -33,9 +33,9 @@ def keep_freed_memory() -> bool:
 
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Has PyTorch use `count` threads inside, and as many as before afterwards.
+    """Makes PyTorch use `count` threads inside the context.
 
-    Sums over threads are rounded differently, so the same number gives the same bits.
+    The number of threads changes how sums are rounded, so only the same number gives the same bits.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(count)

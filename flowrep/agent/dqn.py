@@ -21,7 +21,7 @@ from flowrep.options import DoubleDQNOptions
 
 
 class EpsilonGreedyPolicy(TensorDictSequential):
-    """Writes the action of the largest value or, with probability ε, a uniformly random one."""
+    """Writes the action with the largest value or, with probability ε, a uniformly random one."""
 
     def __init__(
         self,
@@ -39,7 +39,7 @@ class EpsilonGreedyPolicy(TensorDictSequential):
         self.select_out_keys("action")
 
     def get_dist(self, tensordict: TensorDictBase) -> Distribution:
-        """Returns the distribution that actions are drawn from, as other policies do."""
+        """Returns the distribution from which actions are drawn, like other policies."""
         values = self[0](tensordict.copy())["action_value"]
         best = F.one_hot(values.argmax(-1), values.shape[-1])
         epsilon = self[2].eps
@@ -67,12 +67,12 @@ class DoubleDQNMapLoss(DQNLoss):
 class DoubleDQN(OffPolicy):
     """One Q-function and its target; acts at random with a falling probability ε.
 
-    One gradient step minimises, over a batch,
+    One update minimises, over a batch,
 
         L_Q = mean (Q(s, a) - r - γ (1 - terminated) Q̄(s', argmax_a Q(s', a)))²
 
     and moves the target by `tau`. Without exploration (TorchRL's `ExplorationType.DETERMINISTIC`)
-    the policy takes the action of the largest value.
+    the policy takes the action with the largest value.
     """
 
     OPTIONS = DoubleDQNOptions
@@ -115,7 +115,7 @@ class DoubleDQN(OffPolicy):
     def remember(self, steps: TensorDictBase) -> None:
         """Stores steps and lowers ε for each of them."""
         super().remember(steps)
-        # EGreedyModule.step would loop over the frames
+        # EGreedyModule.step would loop over the frames.
         e = self.exploration
         fall = (e.eps_init - e.eps_end) / e.annealing_num_steps * steps.numel()
         e.eps.copy_(torch.maximum(e.eps - fall, e.eps_end))
@@ -123,6 +123,6 @@ class DoubleDQN(OffPolicy):
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Returns the loss, with gradients, and the TD error and ε, without."""
         out = self.loss(batch)
-        td_error = batch["td_error"].sqrt().mean()  # the loss leaves its square there
+        td_error = batch["td_error"].sqrt().mean()  # the loss stores its square
         epsilon = self.exploration.eps.clone()
         return {"q_loss": out["loss"], "td_error": td_error, "epsilon": epsilon}

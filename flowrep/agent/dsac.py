@@ -72,18 +72,18 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
         self._in_keys = transition_keys(self.codecs)
 
     def make_value_estimator(self, *args: Any, **options: Any) -> None:
-        """Sets γ; y is the TD(0) target whatever the type."""
+        """Sets γ; y is the TD(0) target, whatever the type."""
         super().make_value_estimator(*args, **options)
         self.gamma = float(self.value_estimator.gamma)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns the losses of a batch, with gradients, and further metrics, without."""
-        alpha = self.log_alpha.detach().exp()  # L_α alone trains it
-        # before the other maps are decoded: one-hot maps are large
+        alpha = self.log_alpha.detach().exp()  # only L_α trains α
+        # Before the other maps are decoded, because one-hot maps are large.
         target = self._target(tensordict, alpha)
         images = decode_maps(self.codecs, tensordict)
         embedding = self.critic_encoder(images)
-        # neither L_π nor Q in it may train the critic's encoder
+        # L_π must not train the critic's encoder, neither directly nor through Q.
         seen = embedding.detach() if self.encoder_is_shared else self.actor_encoder(images)
         log_policy = self._log_policy(seen)
         policy = log_policy.exp()
@@ -92,9 +92,9 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
         action = self.actions.numbers(tensordict["action"])
         chosen = q.gather(-1, action.expand(2, -1).unsqueeze(-1)).squeeze(-1)
         td_error = chosen - target
-        # the smaller of both Qs: a policy that maximises one seeks out its errors
+        # The smaller Q, because a policy that maximises a single Q exploits its errors.
         expected_q = (policy * q.detach().amin(0)).sum(-1)
-        # H̄ - H: where the policy lacks entropy, L_α raises α
+        # H̄ - H: if the policy's entropy is too low, L_α raises α.
         lack = (negative_entropy.detach() + self.target_entropy).mean()
         return TensorDict(
             {
@@ -112,7 +112,7 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
     def _target(self, batch: TensorDictBase, alpha: Tensor) -> Tensor:
         """Returns y `[N]`."""
         images = decode_maps(self.codecs, batch["next"])
-        # the target encoder is the same module with other weights
+        # The target encoder is the same module with other weights.
         with self.target_critic_encoder_params.to_module(self.critic_encoder):
             embedding = self.critic_encoder(images)
         seen = embedding if self.encoder_is_shared else self.actor_encoder(images)
@@ -129,8 +129,8 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
 class DiscreteSAC(OffPolicy):
     """Actor, two Q-functions and their targets, trained by discrete soft actor-critic.
 
-    One gradient step minimises, over a batch and with π, Q1, Q2 from the embeddings of `s` and `s'`
-    (the paper's Eqs. 2-5 without its state-value network):
+    π, Q1 and Q2 are computed from the embeddings of `s` and `s'`. One update minimises, over a
+    batch (the paper's Eqs. 2-5 without its state-value network):
 
         y   = r + γ (1 - terminated) Σ_a π(a|s') [min_i Q̄_i(s', a) - α log π(a|s')]
         L_Q = mean (Q1(s, a) - y)² + mean (Q2(s, a) - y)²
@@ -138,9 +138,9 @@ class DiscreteSAC(OffPolicy):
         L_α = mean -log α (Σ_a π(a|s) log π(a|s) + H̄),   H̄ = target_entropy_weight · log n
 
     All gradients are taken at the same weights, then Adam steps once, then the targets move by
-    `tau`. ML-Agents halves L_Q (which changes Adam's steps only through its epsilon) and uses Q1
-    alone in L_π. For transitions of several steps, r is the discounted sum of their rewards,
-    without the entropy bonus of the steps between.
+    `tau`. ML-Agents halves L_Q (which changes Adam's steps only through its epsilon) and uses only
+    Q1 in L_π. For transitions of several steps, r is the discounted sum of their rewards, without
+    the entropy bonus of the steps in between.
     """
 
     OPTIONS: ClassVar[type[AlgorithmOptions]] = DiscreteSACOptions

@@ -1,4 +1,4 @@
-"""Discrete soft actor-critic with a state-value network: Eqs. 2-5 as the paper's trainer does."""
+"""Discrete soft actor-critic with a state-value network: Eqs. 2-5 as in the paper's trainer."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class DiscreteSACValueLoss(LossModule):
             {
                 "loss_qvalue": 0.5 * sum(F.mse_loss(q, y) for q in chosen),
                 "loss_value": 0.5 * F.mse_loss(value, value_target),
-                # Q1 alone, as ML-Agents has it
+                # Q1 alone, as in ML-Agents.
                 "loss_actor": (policy * (alpha * log_policy - q1.detach())).sum(-1).mean(),
                 "loss_alpha": -self.log_alpha
                 * (negative_entropy.detach() + self.target_entropy).mean(),
@@ -100,7 +100,7 @@ class DiscreteSACValueLoss(LossModule):
 class DiscreteSACWithValue(DiscreteSAC):
     """Actor, two Q-functions, a state-value function V and its target V̄, sharing no weights.
 
-    One gradient step minimises, over a batch and with Q_i(s, π) = Σ_a π(a|s) Q_i(s, a):
+    One update minimises, over a batch and with Q_i(s, π) = Σ_a π(a|s) Q_i(s, a):
 
         y   = r + γ (1 - terminated) V̄(s')
         L_Q = ½ mean (Q1(s, a) - y)² + ½ mean (Q2(s, a) - y)²

@@ -1,7 +1,7 @@
 """Networks and policies: one Nature encoder per map, then a head with one number per action.
 
-Weights are float32. Encoders and hidden layers compute in the codec's dtype, by autocast; the last
-layer, whose numbers are compared, in float32.
+Weights are float32. By autocast, encoders and hidden layers compute in the codec's dtype. The last
+layer computes in float32, because small differences between its outputs matter.
 """
 
 from __future__ import annotations
@@ -59,7 +59,12 @@ def _autocast_like(x: Tensor) -> AbstractContextManager[Any]:
 
 
 class NatureEncoder(nn.Module):
-    """Returns 512 features of a map: 32 × 8/4, 64 × 4/2, 64 × 3/1, linear; LeakyReLU after each."""
+    """Maps a decoded map `[N, C, H, W]` to 512 features `[N, 512]`.
+
+    The layers are convolutions with (channels, kernel / stride) 32, 8/4; 64, 4/2; 64, 3/1 and a
+    linear layer, each followed by LeakyReLU. Maps of 84 × 84 become 20 × 20, 9 × 9 and 7 × 7; maps
+    of 48 × 48 become 11 × 11, 4 × 4 and 2 × 2.
+    """
 
     def __init__(self, codec: MapCodec) -> None:
         super().__init__()
@@ -71,20 +76,20 @@ class NatureEncoder(nn.Module):
         self.linear = nn.Linear(64 * rows * columns, EMBEDDING_SIZE)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Returns the embeddings `[N, 512]` of a decoded map `[N, C, H, W]`, in its dtype."""
+        """Returns the embeddings `[N, 512]`, in the dtype of the map."""
         with _autocast_like(image):
             x = image
             for convolution in (self.conv1, self.conv2, self.conv3):
                 x = F.leaky_relu_(convolution(x))
-            # rows first, channels last, which is a view of a channels-last map
+            # [N, 64, h, w] to [N, h * w * 64]: a view, because the map is channels-last in memory.
             return F.leaky_relu_(self.linear(x.permute(0, 2, 3, 1).flatten(1)))
 
 
 class Encoder(nn.Module):
-    """Returns the concatenated embeddings of several maps, each through its own `NatureEncoder`.
+    """Concatenates the embeddings of several maps, which have a `NatureEncoder` each.
 
-    With `layer_norm` each embedding has mean 0 and variance 1 (without learnt weights), so that all
-    maps have the same scale and the head's input keeps it.
+    With `layer_norm`, each embedding has mean 0 and variance 1 (without learnt weights), so that
+    all maps have the same scale in the head's input throughout training.
     """
 
     def __init__(self, codecs: Sequence[MapCodec], *, layer_norm: bool = False) -> None:
@@ -106,7 +111,7 @@ class Encoder(nn.Module):
 
 
 class Head(nn.Module):
-    """Maps `[N, embedding]` to `[N, outputs]` float32: linear, Swish, linear."""
+    """Maps `[N, embedding]` to `[N, outputs]` float32: linear, SiLU, linear."""
 
     def __init__(self, embedding_size: int, hidden_size: int, outputs: int) -> None:
         super().__init__()
@@ -117,17 +122,18 @@ class Head(nn.Module):
         """Returns one float32 number per output."""
         with _autocast_like(embedding):
             hidden = F.silu(self.hidden(embedding))
-        # float32, as actions are chosen by small differences of the outputs
+        # float32, because small differences between outputs decide which action is chosen.
         return self.output(hidden.float())
 
 
 def heads_together(embedding: Tensor, weights: Mapping[str, Any]) -> Tensor:
     """Returns the outputs `[heads, N, outputs]` of several heads on one embedding `[N, size]`.
 
-    `weights` are those of `Head` by module and name, stacked along a first dim of heads.
+    `weights` are those of `Head` by module and name, stacked along a first dim of heads: for
+    example, `["hidden"]["weight"]` is `[heads, hidden, size]`.
     """
     hidden, output = weights["hidden"], weights["output"]
-    # the hidden layers are one product, where TorchRL would use vmap
+    # All hidden layers are one product, [N, size] · [size, heads * hidden]; TorchRL would use vmap.
     with _autocast_like(embedding):
         x = F.silu(F.linear(embedding, hidden["weight"].flatten(0, 1), hidden["bias"].flatten()))
     # [N, heads * hidden] to [heads, N, hidden]
@@ -156,7 +162,7 @@ class MapNetwork(nn.Module):
         return self.head(self.encoder(images))
 
     def another(self, outputs: int) -> MapNetwork:
-        """Returns a network for the same maps and sizes with its own weights."""
+        """Returns a network for the same maps and sizes with new weights."""
         layer_norm = self.encoder.layer_norm
         return MapNetwork(self.codecs, self.hidden_size, outputs, layer_norm=layer_norm)
 
@@ -164,7 +170,8 @@ class MapNetwork(nn.Module):
 class PolicyNetwork(nn.Module):
     """Maps raw or stored maps `[*B, C, H, W]`, one argument each, to `[*B, outputs]`.
 
-    Raw maps are rounded as in the replay memory first, so that acting sees what learning sees.
+    Raw maps are first rounded as in the replay memory, so that the agent sees the same values when
+    it acts and when it learns.
     """
 
     def __init__(self, network: MapNetwork) -> None:
@@ -207,7 +214,7 @@ def stochastic_policy(
     """Returns a module that writes `action`, drawn from the softmax of the network's logits.
 
     With `writes_log_prob` it also writes `action_log_prob`. Under TorchRL's
-    `set_exploration_type(ExplorationType.DETERMINISTIC)` it takes the likeliest action instead.
+    `set_exploration_type(ExplorationType.DETERMINISTIC)` it takes the most probable action instead.
     """
     draw = ProbabilisticTensorDictModule(
         in_keys=["logits"],

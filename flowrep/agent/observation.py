@@ -6,8 +6,8 @@
 | `Bounded(0, 255, uint8)` | intensity | uint8 | `x / 255`, C channels |
 | any float | a quantity | two-byte float | itself, C channels |
 
-An id from n to 255 is a pixel without a class, all zeros. One-hot maps are made when a batch is
-decoded, never stored.
+An id from n to 255 is a pixel without a class; all its channels are 0. One-hot maps are computed
+when a batch is decoded, and never stored.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ def compute_dtype(precision: str, device: torch.device) -> torch.dtype:
 def resolved_precision(precision: str, device: torch.device) -> str:
     """Returns `"bf16"` or `"fp32"`; for `"auto"` bfloat16 where it is faster than float32.
 
-    On a CPU, time tells: a run resolves "auto" once and keeps the answer, so that it computes the
-    same when it is resumed.
+    On a CPU, this is measured. A run resolves "auto" once and keeps the answer, so that it computes
+    the same numbers when it is resumed.
     """
     if precision not in PRECISIONS:
         raise ValueError(f"precision={precision!r}: expected one of {', '.join(PRECISIONS)}")
@@ -61,9 +61,9 @@ def has_bf16(device: torch.device) -> bool:
 
 @cache
 def _bf16_products_are_faster() -> bool:
-    # Only the clock tells: AVX-512's dot product of bfloat16 has twice the rate of float32 on some
-    # processors and .6 of it on others. On one thread, in turns, the least of twenty times doesn't
-    # depend on other work on the machine.
+    # Measured, because AVX-512's dot product of bfloat16 has 2 times the rate of float32 on some
+    # processors and 0.6 times on others. On one thread and in turns, the least of twenty times
+    # doesn't depend on other work on the machine.
     least = {torch.bfloat16: math.inf, torch.float32: math.inf}
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -76,7 +76,7 @@ def _bf16_products_are_faster() -> bool:
 
 @dataclass(frozen=True)
 class MapCodec:
-    """One map's key, size, meaning and encoding, for a network in `dtype`, bfloat16 or float32."""
+    """Stores and decodes one map, for a network in `dtype`, bfloat16 or float32."""
 
     key: NestedKey
     channels: int
@@ -115,7 +115,7 @@ class MapCodec:
         Channel c * num_classes + id of a one-hot map is 1 where frame c shows that id.
         """
         if self.num_classes:
-            # looking up rows of the identity is several times faster than comparing ids
+            # Looking up rows of the identity is several times faster than comparing ids.
             identity = torch.eye(256, self.num_classes, device=stored.device, dtype=self.dtype)
             ids = stored.permute(0, 2, 3, 1).int()
             return F.embedding(ids, identity).flatten(-2).permute(0, 3, 1, 2)

@@ -28,7 +28,7 @@ def transition_keys(codecs: Sequence[MapCodec]) -> list[NestedKey]:
 def td_target(batch: TensorDictBase, next_value: Tensor, gamma: float) -> Tensor:
     """Returns r + γⁿ (1 - terminated) V(s') `[N]` of sampled transitions, given V(s') `[N, 1]`."""
     outcome = batch["next"]
-    # masked instead of multiplied: the value after an end may even be nan
+    # Masked instead of multiplied, because the value after an end may be nan.
     next_value = next_value.masked_fill(outcome["terminated"], 0.0)
     discount = gamma ** batch["steps_to_next_obs"]
     return (outcome["reward"] + discount * next_value).squeeze(-1)
@@ -42,10 +42,10 @@ class OffPolicy(Algorithm):
         action_spec: `Categorical` or `OneHot`.
         keys: the observation maps to read, in order.
         options: an instance of the class's `OPTIONS`.
-        total_frames: environment frames over the training, at whose end the learning rate is 0.
-        device: where networks, replay and updates live.
-        mirror_image: with the option `mirror`, the transform of sampled batches that replaces half
-            of each by its left-right images, such as `flowrep.transforms.Mirror`.
+        total_frames: frames of the whole training, at whose end the learning rate is 0.
+        device: the device of networks and replay memory.
+        mirror_image: for the option `mirror`, the transform that replaces half of each sampled
+            batch by mirror images, such as `flowrep.transforms.Mirror`.
     """
 
     OPTIONS: ClassVar[type[AlgorithmOptions]] = OffPolicyOptions
@@ -92,7 +92,7 @@ class OffPolicy(Algorithm):
             self.memory.append_transform(mirror_image)
 
     def updates_due(self, frames: int) -> int:
-        """Returns how many updates `frames` frames allow, less those already taken."""
+        """Returns how many updates are due after `frames` frames, minus those already taken."""
         allowed = max(0, frames - self.learning_starts) // self.options.frames_per_update
         return allowed - self.updates
 

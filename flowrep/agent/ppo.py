@@ -22,22 +22,22 @@ from flowrep.options import PPOOptions
 
 
 class Rollout:
-    """Keeps steps of N environments until `clear`, with their stored maps and next maps."""
+    """Keeps steps of N envs until `clear`, with their stored maps and next maps."""
 
     def __init__(self, codecs: Sequence[MapCodec], device: torch.device) -> None:
         self.codecs, self.device = tuple(codecs), device
         self._steps: list[TensorDictBase] = []
 
     def __len__(self) -> int:
-        """Returns the number of steps of each environment."""
+        """Returns the number of steps of each env."""
         return len(self._steps)
 
     def extend(self, frames: TensorDictBase) -> None:
-        """Stores steps of N environments, with dims as in `time_first`."""
+        """Stores steps of N envs, with dims as in `time_first`."""
         for step in time_first(frames).unbind(0):
             kept = store_maps(self.codecs, step)
             kept.update(step.select("action", "action_log_prob").detach())
-            # with the next maps, since after a truncated step the next row is another episode's
+            # With the next maps, because after a truncated step the next row is of another episode.
             outcome = step["next"].select(*OUTCOME)
             kept["next"] = store_maps(self.codecs, step["next"]).update(outcome)
             self._steps.append(kept.to(self.device))
@@ -58,7 +58,7 @@ class Rollout:
         return {"length": len(self._steps), "steps": stacked}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a `state_dict`."""
+        """Restores a `state_dict`."""
         self.clear()
         if state["length"]:
             shape = [state["length"], len(state["steps"]["action"][0])]
@@ -106,17 +106,18 @@ class ClipPPOMapLoss(ClipPPOLoss):
         return out.set("explained_variance", out["explained_variance"].squeeze())
 
     def _get_entropy(self, dist: Distribution, adv_shape: torch.Size) -> Tensor:
-        # TorchRL's makes the host wait for a check; the divergence watch covers what it checks
+        # TorchRL's version makes the host wait for a check, which the divergence watch replaces.
         return dist.entropy().unsqueeze(-1)
 
 
 class PPO(Algorithm):
     """Policy and state-value function on one set of encoders, learning on-policy.
 
-    After every `rollout_length` steps of each environment, `epochs` passes are made over those
-    steps in shuffled batches. Advantages Â (generalised, then normalised over the batch) and value
-    targets R come from the weights at the beginning of the round. One gradient step minimises, over
-    a batch and with ρ = π(a|s) / π_acted(a|s), where π_acted(a|s) was recorded when a was drawn,
+    After every `rollout_length` steps of each env, a round of updates makes `epochs` passes over
+    these steps in shuffled batches. Advantages Â (generalised, then normalised over the batch) and
+    value targets R are computed with the weights at the beginning of the round. With
+    ρ = π(a|s) / π_acted(a|s), where π_acted(a|s) was stored when a was drawn, one update minimises,
+    over a batch,
 
         L_π = -mean min(ρ Â, clip(ρ, 1 - clip, 1 + clip) Â)
         L_V = value_weight · mean (V(s) - R)²
@@ -151,7 +152,7 @@ class PPO(Algorithm):
         if options.batch_size > frames_per_round:
             raise ValueError(
                 f"batch_size={options.batch_size} is more than the {frames_per_round} frames of a "
-                f"rollout ({steps} steps of {self.num_envs} environments): raise rollout_length or "
+                f"rollout ({steps} steps of {self.num_envs} envs): raise rollout_length or "
                 "num_envs, or lower batch_size"
             )
         self.policy = self.make_policy(
@@ -163,7 +164,7 @@ class PPO(Algorithm):
         self.codecs = network.codecs
         self.memory = Rollout(self.codecs, torch.device(device))
         self._round: TensorDictBase = TensorDict()  # the steps in training, [n]
-        self._batches: list[Tensor] = []  # rows of the batches to come
+        self._batches: list[Tensor] = []  # rows of the round's remaining batches
         super().__init__(
             self.LOSS(network, actions, options),
             learning_rate=options.learning_rate,
@@ -183,7 +184,7 @@ class PPO(Algorithm):
         """Returns the round's next batch; the first call begins the round and clears the memory."""
         if not self._batches:
             self._round = self._with_advantages(self.memory.steps()).reshape(-1)
-            self.memory.clear()  # no frame is learnt from in two rounds
+            self.memory.clear()  # each frame belongs to one round
             size = self.options.batch_size
             for _ in range(self.options.epochs):
                 rows = torch.randperm(len(self._round)).split(size)
@@ -192,9 +193,9 @@ class PPO(Algorithm):
 
     @torch.no_grad()
     def _with_advantages(self, steps: TensorDictBase) -> TensorDictBase:
-        """Returns steps `[N, T]` with `advantage` and `value_target`, by the current weights."""
+        """Adds `advantage` and `value_target`, by the current weights, to steps `[N, T]`."""
         for some in (steps, steps["next"]):
-            parts = some.reshape(-1).split(self.options.batch_size)  # as large as training has them
+            parts = some.reshape(-1).split(self.options.batch_size)  # as in training
             values = torch.cat([self.loss.state_value(part) for part in parts])
             some["state_value"] = values.reshape(*steps.shape, 1)
         return self._advantage(steps)

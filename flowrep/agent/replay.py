@@ -1,7 +1,7 @@
 """Replay of stored maps: a storage, a sampler and a transform for a TorchRL replay buffer.
 
-Each observation is stored once. A row holds the maps observed, the action and its outcome; the
-next observation is in the row of the following step.
+Each observation is stored once. A row holds the observed maps, the action, the reward and the end
+flags; the next observation is in the row of the next step.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class ReplayMemory(TensorDictReplayBuffer):
     over those steps), `done` and `terminated`.
 
     Args:
-        codecs: the maps to keep; see `flowrep.agent.observation`.
-        capacity: rows to keep; beyond that, the oldest is overwritten.
+        codecs: the maps to store; see `flowrep.agent.observation`.
+        capacity: number of rows; beyond it, the oldest row is overwritten.
         n_steps: see `SuccessorSampler`, as for `gamma`.
     """
 
@@ -55,12 +55,12 @@ class ReplayMemory(TensorDictReplayBuffer):
         )
 
     def add(self, data: TensorDictBase) -> int:
-        """Stores one step of a single environment and returns its row."""
+        """Stores one step of a single env and returns its row."""
         return int(self.extend(data.reshape(1)))
 
 
 class PackSteps(Transform):
-    """Turns steps into rows on `extend`. Samples stay as they are: losses decode their maps.
+    """Turns steps into rows on `extend`. Samples don't change; losses decode their maps.
 
     | steps, on `extend` | rows |
     | --- | --- |
@@ -68,7 +68,7 @@ class PackSteps(Transform):
     | the maps | in their stored form |
     | `action`, `is_init` | unchanged |
     | `("next", name)` of `reward`, `done`, `terminated` | `name` |
-    | | `env`: index of the environment, from 0 to N - 1 |
+    | | `env`: index of the env, from 0 to N - 1 |
     """
 
     def __init__(self, codecs: Sequence[MapCodec]) -> None:
@@ -95,7 +95,7 @@ class PackSteps(Transform):
 
 
 class RowStorage(LazyTensorStorage):
-    """A TorchRL storage that also returns transitions, and saves only written rows."""
+    """A TorchRL storage that also returns transitions, and saves only the rows that are written."""
 
     _storage: Any
 
@@ -116,7 +116,7 @@ class RowStorage(LazyTensorStorage):
         """
         if not (isinstance(index, Tensor) and index.ndim == 2 and self.initialized):
             return super().get(index)
-        # indexing a TensorDict with a tensor takes 2.4 times as long as index_select
+        # Indexing a TensorDict with a tensor takes 2.4 times as long as index_select.
         first, following = index.unbind(1)
         transitions = TensorDict({}, first.shape, device=self._storage.device)
         for key in self.observation_keys:
@@ -131,7 +131,7 @@ class RowStorage(LazyTensorStorage):
         return {"capacity": self.max_size, "rows": rows, "size": len(self)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a `state_dict` of a storage of the same capacity."""
+        """Restores a `state_dict` of a storage of the same capacity."""
         if state["capacity"] != self.max_size:
             raise ValueError(
                 f"the saved replay memory has capacity {state['capacity']}, this one "
@@ -144,16 +144,16 @@ class RowStorage(LazyTensorStorage):
 
 
 class SuccessorSampler(Sampler):
-    """Draws pairs of rows, uniform with replacement: a step and the one after its transition.
+    """Draws pairs of rows, uniform with replacement: the first step of a transition and the next.
 
-    A step can be drawn once the next step of its environment is stored. A terminal step has no
-    next step; its own row takes that place, and `terminated` masks the value. If the episode was
-    truncated (`done` without `terminated`) or the next row `is_init`, the next observation was
-    never stored, and the step is not drawn.
+    A step can be drawn once the next step of its env is stored. A terminal step has no next step,
+    so its own row is used instead, and `terminated` masks the value. If the episode was truncated
+    (`done` without `terminated`) or the next row `is_init`, the next observation was never stored,
+    and the step is not drawn.
 
-    A transition spans `n_steps` steps, whose rewards are discounted by `gamma`. It ends earlier
-    with its episode, or where the next step is not stored. Each `extend` must add whole steps of
-    all environments, as with `PackSteps`.
+    A transition spans `n_steps` steps, whose rewards are discounted by `gamma`. It is shorter if
+    its episode ends before, or if the next step is not stored. Each `extend` must add whole steps
+    of all envs, as with `PackSteps`.
     """
 
     def __init__(self, n_steps: int = 1, gamma: float = 1.0) -> None:
@@ -164,10 +164,10 @@ class SuccessorSampler(Sampler):
 
     def _empty(self) -> None:
         self._next_row = torch.empty(0, dtype=torch.long)  # -1: the next step is not stored
-        self._latest = torch.empty(0, dtype=torch.long)  # each environment's, -1: its episode ended
+        self._latest = torch.empty(0, dtype=torch.long)  # each env's row; -1: its episode ended
 
     def mark_update(self, index: Tensor, *, storage: Storage) -> None:
-        """Links each row just written to the previous row of its environment."""
+        """Links each row just written to the previous row of its env."""
         rows = storage[:]
         marks = [rows[name].flatten() for name in ("env", "done", "terminated", "is_init")]
         written = torch.stack([mark[index.to(mark.device)].long() for mark in marks]).cpu()
@@ -176,14 +176,14 @@ class SuccessorSampler(Sampler):
         if len(index) + envs > storage.max_size:
             raise ValueError(
                 f"a replay capacity of {storage.max_size} cannot take {len(index) // envs} steps "
-                f"of {envs} environments; it has to hold {len(index) + envs}: raise "
+                f"of {envs} envs; it has to hold {len(index) + envs}: raise "
                 "replay_capacity or lower num_envs"
             )
         if not len(self._next_row):
             self._next_row = torch.full((storage.max_size,), -1)
-        # also forgets the links of the rows that these overwrite
+        # This also forgets the links of the rows that are overwritten.
         self._next_row[index] = torch.where(terminated, index, -1)
-        # `before` and `after` pair each step with the one before it, `envs` rows back
+        # `before` and `after` pair each step with the previous one, which is `envs` rows back.
         ahead = torch.where(done | terminated, -1, index)
         known = self._latest if len(self._latest) == envs else self._latest[:0]
         before = torch.cat([known, ahead[:-envs]])
@@ -211,10 +211,10 @@ class SuccessorSampler(Sampler):
         reward = rewards.index_select(0, first.to(rewards.device))
         for _ in range(self.n_steps - 1):
             ahead = self._next_row[last]
-            # a terminal step is its own successor, and one without a successor can't be the last
+            # A terminal step is its own successor, and a step without one can't be the last.
             goes_on = (ahead != last) & (self._next_row[ahead] >= 0)
             last = torch.where(goes_on, ahead, last)
-            # γ to the number of steps so far, or 0 where the transition has ended
+            # γ to the power of the steps so far, or 0 where the transition has ended.
             weight = (self.gamma**steps * goes_on[:, None]).to(rewards.device)
             reward = reward + weight * rewards.index_select(0, last.to(rewards.device))
             steps = steps + goes_on[:, None]
@@ -225,23 +225,23 @@ class SuccessorSampler(Sampler):
         return {"next_row": self._next_row, "latest": self._latest}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a `state_dict`."""
+        """Restores a `state_dict`."""
         self._next_row, self._latest = state["next_row"].clone(), state["latest"].clone()
 
     def dumps(self, path: str | Path) -> None:
-        """Writes the links to a file in the folder `path`, which is created if it is absent."""
+        """Writes the links to a file in the folder `path`, which is created if needed."""
         Path(path).mkdir(exist_ok=True)
         torch.save(self.state_dict(), Path(path) / "links.pt")
 
     def loads(self, path: str | Path) -> None:
-        """Continues from the file that `dumps` wrote."""
+        """Restores the file that `dumps` wrote."""
         self.load_state_dict(torch.load(Path(path) / "links.pt", weights_only=True))
 
 
 def time_first(frames: TensorDictBase) -> TensorDictBase:
-    """Returns frames of N environments as `[T, N]`.
+    """Returns frames of N envs as `[T, N]`.
 
-    A dim named `time` is T; without one, a single dim is N, and of several the last is T.
+    A dim named `time` is T. Without one, a single dim is N, and the last of several dims is T.
     """
     names = list(frames.names)
     if "time" not in names and frames.ndim < 2:

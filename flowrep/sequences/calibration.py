@@ -59,7 +59,7 @@ class ColourCamera(Camera):
 
 
 class Cameras(Camera):
-    """Depth's camera, and colour's if it is another."""
+    """The depth camera, and the colour camera if it is a separate one."""
 
     colour: ColourCamera | None = None
 
@@ -91,8 +91,8 @@ def camera_matrix(
         numbers: fx, fy, cx, cy; the 9, 12 or 16 numbers of a matrix; or one, the focal length in
             picture widths, of a camera with square pixels and a centred axis.
         size: of the picture, height and width.
-        first_pixel_centre: where the numbers put the centre of pixel (0, 0): 0 as OpenCV
-            calibrates, or 0.5.
+        first_pixel_centre: the coordinates of the centre of pixel (0, 0) for these numbers: 0 from
+            an OpenCV calibration, or 0.5.
 
     >>> camera_matrix([525.0, 525.0, 319.5, 239.5], (480, 640), 0.0)[:2, 2]
     array([320., 240.])
@@ -139,12 +139,12 @@ def as_pose(
 
 
 class Undistortion:
-    """Takes the distortion of a lens out of maps; the camera that is left has the same K.
+    """Removes the distortion of a lens from maps; K doesn't change.
 
     Args:
         K: the camera's, in flowrep's convention.
-        distortion: OpenCV's k1, k2, p1, p2, k3, ... of 4, 5, 8, 12 or 14 numbers; its k1 to k4 of a
-            fisheye.
+        distortion: OpenCV's k1, k2, p1, p2, k3, ..., 4, 5, 8, 12 or 14 numbers; or k1 to k4 of its
+            fisheye model.
         size: height and width.
     """
 
@@ -164,7 +164,7 @@ class Undistortion:
         )
 
     def __call__(self, image: Any, *, nearest: bool = False) -> Any:
-        """Returns the map of the rectified camera; nan, or black, where the lens saw nothing."""
+        """Returns the rectified map; nan, or black, outside of the lens's picture."""
         border = np.nan if image.dtype.kind == "f" else 0.0
         way = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
         columns, rows = self._maps
@@ -194,11 +194,11 @@ class Registration:
     ) -> None:
         self.size = size
         self.depth_from_colour = np.linalg.inv(colour_from_depth)
-        # The largest focal length of the colour camera over the smallest of the depth camera.
+        # The largest focal length of the colour camera divided by the smallest of the depth camera.
         self._finer = np.float32(
             max(K_colour[0, 0], K_colour[1, 1]) / min(K_depth[0, 0], K_depth[1, 1])
         )
-        # p_colour ~ z (to_colour @ pixel) + shift, so only one product per pixel is left to do.
+        # p_colour ~ z (to_colour @ pixel) + shift, so each frame needs only one product per pixel.
         self._to_colour = K_colour @ colour_from_depth[:3, :3] @ np.linalg.inv(K_depth)
         self._shift = (K_colour @ colour_from_depth[:3, 3]).astype(np.float32)
         self._rays = np.empty((3, 0, 0), np.float32)  # to_colour @ pixel, of the last size seen

@@ -1,4 +1,4 @@
-"""Recordings by declaration: which files they hold and in which conventions, see conf/format/."""
+"""Recordings whose files and conventions are declared in a YAML file, see conf/format/."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ PLAY_BACKWARDS = (
 class DeclaredRecording(Recording):
     """A folder of numbered or time-stamped pictures and depth maps, and of tables of numbers.
 
-    `conf/format/frames.yaml` explains all options and holds those of the plain layout;
-    `open_recording` reads it and the formats that say what is different in theirs.
+    `conf/format/frames.yaml` explains all options and sets those of the plain layout.
+    `open_recording` reads it and the other formats, which state what differs.
     """
 
     folder: Path
@@ -143,7 +143,7 @@ class DeclaredRecording(Recording):
         return path.parent.is_dir() and any(path.parent.glob(path.name))
 
     def _flow_fits(self) -> tuple[bool, str]:
-        """Returns whether the recording's own flow can be used, or else why not."""
+        """Returns whether the recorded flow can be used, and if not, why."""
         if self.flow is None:
             return False, self.no_flow
         if (self.flow_to == "next") != self.backwards:
@@ -178,13 +178,13 @@ class DeclaredRecording(Recording):
             return found, None
         return found, _ascending(path, np.array(times) * self.time_unit_s)
 
-    # What belongs together.
+    # How files and rows belong together.
 
     def _match_depth(self, depths: dict[str, Path], times_s: Floats | None) -> LeftOut:
         """Finds the depth map of each frame; returns the frames that have none."""
         if self.depth_by == "time" and self._times_s is not None and times_s is not None:
             rows = nearest(times_s, self._times_s, self.tolerance_s)
-            # Two pictures may be nearest to one depth map: it belongs to the nearer of them.
+            # Two pictures may have the same nearest depth map; it belongs to the nearer picture.
             frames = nearest(self._times_s, times_s, self.tolerance_s)
             self._depths = [[*depths.values()][row] for row in rows]
             lacking = (rows < 0) | (frames[rows] != np.arange(len(rows)))
@@ -251,7 +251,7 @@ class DeclaredRecording(Recording):
             turns = numbers.reshape(len(numbers), -1, 4)[:, :3, :3].reshape(-1, 9)
         lost = ~np.isfinite(numbers).all(1) | (turns == 0).all(1)
         if not lost.all():
-            numbers[lost] = numbers[~lost][0]  # so that an error names the row that is wrong
+            numbers[lost] = numbers[~lost][0]  # so that errors name the wrong row
             options: Any = {"direction": self.pose_direction, "axes": self.pose_axes}
             poses = as_pose(numbers, path, layout=self.pose_layout, **options)
             if self.marker_from_cam is not None:
@@ -306,7 +306,7 @@ class DeclaredRecording(Recording):
         return table.reshape(1, -1)
 
     def _choose(self, left_out: LeftOut) -> None:
-        """Numbers the frames that are left, in the order in which they are played."""
+        """Numbers the remaining frames, in the order in which they are read."""
         kept, notes = np.ones(len(self._names), dtype=bool), []
         for why, frames in left_out.items():
             kept &= ~frames
@@ -324,7 +324,7 @@ class DeclaredRecording(Recording):
         values = self._times_s
         if values is None:
             values = np.array([float(_number(name)) for name in self._names])
-        # The number of each frame if none was missing.
+        # The number that each frame would have if none were missing.
         steps = np.diff(values)
         usual = np.median(steps) if len(steps) and (steps > 0).all() else np.inf
         self._positions = np.append(0, np.rint(steps / usual).clip(1).cumsum()).astype(int)
@@ -378,7 +378,7 @@ class DeclaredRecording(Recording):
         return Frame(name, source, pose, K, depth, rgb, time_s, raw, since, **position)
 
     def _once(self, make: Any, *arguments: Any) -> Any:
-        """Returns what `make` makes of arguments, the same while they don't change."""
+        """Returns `make` of the arguments, and the same object until they change."""
         made = self._made.get(make)
         if made is None or not all(map(np.array_equal, made[0], arguments)):
             made = self._made[make] = arguments, make(*arguments)
@@ -402,7 +402,7 @@ class DeclaredRecording(Recording):
 
     def _raw(self, pattern: str, name: str, other: str) -> files.Flow:
         stored = files.read_flow(self._file(pattern, "flow", name, next=other), self.flow_coding)
-        # Played backwards, the next frame is the one before.
+        # If it is read backwards, the next frame is the previous one.
         is_forward = (self.flow_direction == "forward") != (self.flow_to == "next")
         options: Any = {"direction": "forward" if is_forward else "backward"}
         options |= {"grid": self.flow_grid, "channels": self.flow_channels}
@@ -437,7 +437,7 @@ def nearest(times_s: Floats, wanted_s: Floats, tolerance_s: float) -> Indices:
 def between(
     times_s: Floats, wanted_s: Floats, tolerance_s: float
 ) -> tuple[Indices, Indices, Floats]:
-    """Returns the times before and after each wanted one, -1 if too far, and the share between."""
+    """Returns indices before and after each wanted time, -1 if too far, and the share between."""
     after = np.searchsorted(times_s, wanted_s).clip(0, len(times_s) - 1)
     before = np.where(times_s[after] == wanted_s, after, after - 1)
     gaps = wanted_s - times_s[before], times_s[after] - wanted_s
@@ -447,7 +447,7 @@ def between(
 
 
 def interpolated_pose(before: Pose, after: Pose, share: float) -> Pose:
-    """Returns the pose at a share of the way, with constant velocity and angular velocity."""
+    """Returns the pose at a share of the way, for constant velocity and angular velocity."""
     axis_angle, _ = cv2.Rodrigues(before[:3, :3].T @ after[:3, :3])
     pose = np.eye(4)
     pose[:3, :3] = before[:3, :3] @ cv2.Rodrigues(share * axis_angle)[0]
@@ -456,7 +456,7 @@ def interpolated_pose(before: Pose, after: Pose, share: float) -> Pose:
 
 
 def declaration(format_name: str) -> dict[str, Any]:
-    """Returns the keys of `conf/format/<name>.yaml` and of the formats that it begins with."""
+    """Returns the keys of `conf/format/<name>.yaml` and of the formats from which it starts."""
     plain: Any = OmegaConf.to_container(OmegaConf.load(CONF_DIR / f"format/{format_name}.yaml"))
     keys: dict[str, Any] = {}
     for base in plain.pop("defaults", []):

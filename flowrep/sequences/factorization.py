@@ -20,17 +20,17 @@ from flowrep.sequences.recording import Frame, Pose, SequenceError
 if TYPE_CHECKING:
     from flowrep.transforms.estimated_flow import Estimator
 
-# The squared error of going there and back is below a hundredth of the squared lengths plus half a
-# square pixel: Sundaram, Brox and Keutzer, "Dense point trajectories", 2010.
+# A pixel is consistent if the squared error of following both flows is below 0.01 times the sum of
+# the squared lengths, plus 0.5 px²: Sundaram, Brox and Keutzer, "Dense point trajectories", 2010.
 _CONSISTENT_SHARE, _CONSISTENT_PX2 = 0.01, 0.5
 
 
 @dataclass(frozen=True)
 class Motion:
-    """The camera's motion `prev_from_curr` `[4, 4]` between two frames, the identity if not known.
+    """The camera's motion `prev_from_curr` `[4, 4]` between two frames, the identity if unknown.
 
     Attributes:
-        inlier_share: the share of the pixels that move as the estimate says; nan of a recorded one.
+        inlier_share: the share of the pixels that agree with an estimate; nan if it is recorded.
     """
 
     prev_from_curr: Pose = field(default_factory=lambda: np.eye(4))
@@ -39,23 +39,23 @@ class Motion:
 
     @property
     def is_estimated(self) -> bool:
-        """Whether it comes from flow and depth, and not from recorded poses."""
+        """Whether it comes from flow and depth instead of recorded poses."""
         return not math.isnan(self.inlier_share)
 
 
 @dataclass(frozen=True)
 class FactorizedFrame:
-    """One frame's flow since the frame before.
+    """The flow of a frame since the previous frame.
 
-    Convention: p_t - p_t' on the frame's own grid, pixels, (u right, v down).
+    Convention: p_t - p_t' on the grid of frame t, pixels, (u right, v down).
 
     Attributes:
         raw: `[2, H, W]`, nan where unknown.
         ego: `[2, H, W]`, 0 where `ego_valid` is false.
         obj: `[2, H, W]`, raw - ego where both are known and trusted, 0 elsewhere.
         valid: `[H, W]`, where raw and ego are known and trusted.
-        ego_valid: `[H, W]`, where ego is, whatever raw is: depth is known, and the point was in
-            front of the previous camera.
+        ego_valid: `[H, W]`, where ego is known, whatever raw is: depth is known, and the point was
+            in front of the previous camera.
     """
 
     frame: Frame
@@ -73,7 +73,7 @@ MotionSource = Callable[[Frame, Frame, Flow], Motion]  # from these and raw flow
 
 
 def recorded_flow(previous: Frame, current: Frame) -> Flow:
-    """Returns the recording's own flow, if it is measured from the frame before."""
+    """Returns the recorded flow, if it is measured from the previous frame."""
     if current.raw is None:
         raise SequenceError(current.source, "has no flow of its own: use flow=estimated")
     if current.raw_since != previous.name:
@@ -90,8 +90,8 @@ class EstimatedFlowSource:
 
     Args:
         estimator: see `flowrep.transforms.EstimatedFlow`.
-        check_consistency: whether flow is estimated both ways and marked as unknown where a pixel
-            does not return to where it was: at occlusions and at errors.
+        check_consistency: whether flow is also estimated in the opposite direction. Where a pixel
+            doesn't return to its position (at occlusions and errors), it is marked as unknown.
     """
 
     estimator: Estimator
@@ -100,7 +100,7 @@ class EstimatedFlowSource:
 
     @torch.no_grad()
     def __call__(self, previous: Frame, current: Frame) -> Flow:
-        """Returns raw flow; all unknown where the picture is repeated although the camera moved."""
+        """Returns raw flow; all of it is unknown if a picture repeats although the camera moved."""
         if previous.rgb is None or current.rgb is None:
             cause = "has no picture to estimate flow from: use flow=exact"
             raise SequenceError(current.source, cause)
@@ -117,7 +117,7 @@ class EstimatedFlowSource:
 
 
 def consistent(back: Flow, forth: Flow) -> NDArray[np.bool_]:
-    """Returns where a pixel that goes back and then forth returns to where it was, `[H, W]`.
+    """Returns where a pixel that follows both flows returns to its position, `[H, W]`.
 
     Each flow `[2, H, W]` is on the grid of the picture that it starts from.
     """
@@ -134,7 +134,7 @@ def consistent(back: Flow, forth: Flow) -> NDArray[np.bool_]:
 
 def repeats(previous: Frame, current: Frame) -> bool:
     """Returns whether a frame only repeats the previous picture although the camera moved."""
-    # Kinects do so when they miss a picture; 7-Scenes has many such frames.
+    # Kinects repeat a picture when they miss one; 7-Scenes has many such frames.
     if previous.rgb is None or current.rgb is None or current.raw is not None:
         return False
     before, now = previous.world_from_cam, current.world_from_cam
@@ -143,7 +143,7 @@ def repeats(previous: Frame, current: Frame) -> bool:
 
 
 def pairs(frames: Iterable[Frame]) -> Iterator[tuple[Frame | None, Frame]]:
-    """Yields each frame after the one that its flow is measured from, None if a clip starts."""
+    """Yields each frame with the previous one, or None at the start of a clip."""
     previous: Frame | None = None
     for current in frames:
         if previous is not None and previous.clip != current.clip:
@@ -159,7 +159,7 @@ def pairs(frames: Iterable[Frame]) -> Iterator[tuple[Frame | None, Frame]]:
 
 
 def recorded_motion(previous: Frame, current: Frame, raw: Flow) -> Motion:
-    """Returns the camera's motion by the recorded poses."""
+    """Returns the camera's motion from the recorded poses."""
     if previous.world_from_cam is None or current.world_from_cam is None:
         raise SequenceError(current.source, "has no pose: use poses=estimated")
     poses = (torch.from_numpy(frame.world_from_cam) for frame in (previous, current))
@@ -167,10 +167,10 @@ def recorded_motion(previous: Frame, current: Frame, raw: Flow) -> Motion:
 
 
 def estimated_motion(previous: Frame, current: Frame, raw: Flow) -> Motion:
-    """Returns the camera's motion that most of the picture's flow and depth agree on."""
+    """Returns the camera's motion that fits the flow and depth of most pixels."""
     depth, K = torch.from_numpy(current.depth)[None], torch.from_numpy(current.K).float()
     picture = None
-    # Texture tells which estimated flow can be trusted: where there is none, flow is 0.
+    # The picture shows which estimated flow can be trusted: without texture, flow is 0.
     if current.rgb is not None and raw is not current.raw:
         picture = torch.from_numpy(current.rgb).permute(2, 0, 1)
     prev_K = _previous_K(previous, current)

@@ -1,7 +1,6 @@
 """Files of recordings: text, JSON, pictures, arrays, depth maps and flow.
 
-What is invalid raises `SequenceError`, which names the file; what is missing, `OSError`, which does
-so too.
+An invalid file raises `SequenceError`, a missing one `OSError`; both name the file.
 """
 
 from __future__ import annotations
@@ -31,11 +30,11 @@ _SUFFIXES = {
     "numbers": (".txt", ".csv", ".json", ".cam"),
 }
 FLO_TAG = 202021.25
-_FLO_UNKNOWN, _FLO_LARGEST = 1e10, 1e9  # what is written for unknown flow, and what is not read
+_FLO_UNKNOWN, _FLO_LARGEST = 1e10, 1e9  # written for unknown flow; larger values are unknown
 
 
 def find_files(path: Path, kind: str) -> dict[str, Path]:
-    """Returns the files of a pattern by what `*` stands for, in the order of their numbers.
+    """Returns the files of a pattern by their names (the text for `*`), in the order of numbers.
 
     A pattern without a suffix finds the files of all suffixes of its kind.
     """
@@ -55,7 +54,7 @@ def find_files(path: Path, kind: str) -> dict[str, Path]:
 
 
 def _natural(name: str) -> list[int | str]:
-    # frame_9 comes before frame_10; texts and numbers take turns, so all are comparable
+    # frame_9 comes before frame_10; texts and numbers alternate, so that all are comparable.
     return [int(piece) if piece.isdecimal() else piece for piece in re.split(r"([0-9]+)", name)]
 
 
@@ -68,7 +67,7 @@ def with_suffix(path: Path, kind: str) -> Path:
 
 
 def regular(path: Path) -> Path:
-    """Returns a path, unless it is that of a pipe, which would be read for ever."""
+    """Returns a path, unless it is a pipe, from which reading might never end."""
     if path.exists() and not path.is_file():
         raise SequenceError(path, "is no file")
     return path
@@ -121,7 +120,7 @@ def read_array(path: Path) -> NDArray[Any]:
     suffix, array = path.suffix.lower(), None
     try:
         if suffix == ".npy":
-            # Mapped, since memory for what a broken header promises would be allocated.
+            # Memory-mapped; otherwise, memory for the size in a broken header would be allocated.
             mapped = np.load(regular(path), mmap_mode="r")
             array = np.array(mapped) if isinstance(mapped, np.ndarray) else None
         elif suffix in (".flo", ".dpt"):
@@ -144,8 +143,8 @@ def read_array(path: Path) -> NDArray[Any]:
 
 
 def _decoded(data: bytes) -> NDArray[Any] | None:
-    # Before version 5 OpenCV fills up a picture that was cut off with grey and says nothing, so
-    # look for its end. Some cameras write a few bytes after it.
+    # Before version 5, OpenCV silently fills a truncated picture with grey, so look for the end
+    # marker. Some cameras write a few bytes after it.
     end = {b"\x89P": b"IEND", b"\xff\xd8": b"\xff\xd9"}.get(data[:2], b"")
     if not data or end not in data[-4096:]:
         return None
@@ -185,10 +184,10 @@ def read_depth(
     """Returns stored depth `[H, W]` in metres: nan where missing, inf where there is no surface.
 
     Args:
-        unit_m: the length of a stored 1; None is a millimetre of whole numbers, a metre of floats.
-        missing: whole numbers that mean so.
-        no_surface: the whole number that means so.
-        coding: of colour pictures: `"float32_rgba"`, the bytes of a float are blue, green, red and
+        unit_m: metres of a stored 1; None is 0.001 for whole numbers and 1 for floats.
+        missing: whole numbers that mean missing depth.
+        no_surface: the whole number that means no surface.
+        coding: of colour pictures: `"float32_rgba"`, a float whose bytes are blue, green, red and
             alpha (TartanAir V2); `"rgb24"`, red + 256 green + 65536 blue (CARLA).
     """
     stored = read_array(path)
@@ -211,7 +210,7 @@ def read_depth(
 
 
 def usual_unit_m(stored: NDArray[Any]) -> float:
-    """Returns the length of a stored 1: a millimetre of whole numbers, a metre of floats."""
+    """Returns the metres of a stored 1: 0.001 for whole numbers, 1 for floats."""
     return 0.001 if stored.dtype.kind in "ui" and stored.ndim == 2 else 1.0
 
 
@@ -247,7 +246,7 @@ def read_flow(path: Path, coding: FlowCoding = "kitti") -> Flow:
 
 
 def write_flo(path: Path, flow: Flow, valid: NDArray[np.bool_] | None = None) -> None:
-    """Writes flow `[2, H, W]`; invalid pixels get the format's mark for unknown."""
+    """Writes flow `[2, H, W]`; invalid pixels get the format's value for unknown flow."""
     _, height, width = flow.shape
     known = np.isfinite(flow).all(0) & (valid is None or valid)
     marked = np.where(known, flow, np.float32(_FLO_UNKNOWN)).transpose(1, 2, 0)
@@ -256,7 +255,7 @@ def write_flo(path: Path, flow: Flow, valid: NDArray[np.bool_] | None = None) ->
 
 
 def write_kitti_flow(path: Path, flow: Flow, valid: NDArray[np.bool_] | None = None) -> None:
-    """Writes flow `[2, H, W]` in steps of 1/64 px; beyond 512 px it is marked as unknown."""
+    """Writes flow `[2, H, W]` in steps of 1/64 px; flow beyond 512 px is marked as unknown."""
     known = np.isfinite(flow).all(0) & (valid is None or valid)
     steps = np.rint(np.where(known, flow, 0.0) * 64) + 2**15
     known &= ((steps >= 0) & (steps < 2**16)).all(0)
@@ -265,8 +264,8 @@ def write_kitti_flow(path: Path, flow: Flow, valid: NDArray[np.bool_] | None = N
 
 
 def write_picture(path: Path, image: NDArray[Any]) -> None:
-    """Writes a picture `[H, W]` or `[H, W, 3]` as a PNG, compressed fast rather than well."""
-    # Not imwrite, which says nothing of a full disk.
+    """Writes a picture `[H, W]` or `[H, W, 3]` as a PNG, with fast rather than good compression."""
+    # Not imwrite, which doesn't report a full disk.
     blue_green_red = image if image.ndim == 2 else image[..., ::-1]
     data = cv2.imencode(".png", blue_green_red, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
     path.write_bytes(data.tobytes())

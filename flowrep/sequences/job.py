@@ -16,7 +16,7 @@ from flowrep.sequences import factorization
 from flowrep.sequences.output import Output
 from flowrep.sequences.recording import Frame, Recording, Stream
 
-# Pairs follow each other in runs, so that poses that are late or early show.
+# Pairs are examined in consecutive groups, so that poses that lag or lead are noticed.
 EXAMINED_RUNS, EXAMINED_PAIRS = 4, 5
 
 
@@ -44,7 +44,7 @@ class Job:
             self._indices = range(len(self.stream))[self.start : self.stop : self.stride]
 
     def examine(self) -> Diagnosis | None:
-        """Returns the diagnosis of pairs in runs spread over the recording, None of a stream."""
+        """Returns the diagnosis of groups of pairs across the recording, None for a stream."""
         if not isinstance(self.stream, Recording):
             return None
         is_recorded = self.flow_source is factorization.recorded_flow
@@ -61,7 +61,7 @@ class Job:
                 poses = [None, *(frame.world_from_cam for frame in frames), None]
                 around = {f.name: (poses[i], poses[i + 2]) for i, f in enumerate(frames)}
                 for previous, current in factorization.pairs(frames):
-                    # A picture that repeats the one before has the flow of none.
+                    # A picture that repeats the previous one has no flow to examine.
                     if previous is not None and not factorization.repeats(previous, current):
                         raw = self.flow_source(previous, current)
                         earlier, later = around[previous.name][0], around[current.name][1]
@@ -69,7 +69,7 @@ class Job:
             return examination.diagnosis()
 
     def run(self) -> int:
-        """Factorises all frames; returns 0, or the exit code for the signal that stopped it."""
+        """Factorises all frames; returns 0, or the exit code of the signal that stopped it."""
         is_recording = isinstance(self.stream, Recording)
         total = len(self._indices) if is_recording else None
         with StopRequest() as interrupted, tqdm(total=total, unit="frame") as bar:
@@ -89,11 +89,11 @@ class Job:
                     break
             bar.set_description("completing the video")
             self.output.close()
-        return interrupted.exit_code if is_recording else 0  # a signal is the end of a camera
+        return interrupted.exit_code if is_recording else 0  # a signal is how a camera's job ends
 
     def _frames(self) -> Iterator[Frame]:
         frames: Iterator[Frame] = islice(self.stream, self.start, self.stop, self.stride)
-        if isinstance(self.stream, Recording):  # those in between are not read
+        if isinstance(self.stream, Recording):  # skipped frames are not read
             frames = map(self.stream.__getitem__, self._indices)
         while True:
             with self.clock("reading"):

@@ -20,7 +20,7 @@ _OXTS_NUMBERS = 30
 
 
 class Kitti(Recording):
-    """The `training` folder of the benchmark, and the raw recordings that it was taken from.
+    """The `training` folder of the benchmark, and the raw recordings from which it was taken.
 
     Flow and disparity are given on the first picture of each pair (`_10`) and lead to the second
     (`_11`). Time is therefore read backwards: each pair is a clip of two frames, `_11` first, then
@@ -84,7 +84,8 @@ class Kitti(Recording):
             path = self.folder / "disp_occ_0" / f"{name}.png"
             disparity_px = files.read_depth(path, 1 / 256, missing=(0,)).astype(np.float64)
             depth = (focal_baseline / disparity_px).astype(np.float32)
-            # Given is p_11 - p_10. Here 11 is the frame before, so that p_t - p_t' is the opposite.
+            # The file has p_11 - p_10. As 11 is the previous frame here, p_t - p_t' is the
+            # opposite.
             raw = -files.read_flow(self.folder / "flow_occ" / f"{name}.png")
             since = f"{pair}_11"
         world_from_cam = None

@@ -23,20 +23,20 @@ from flowrep.tables import append_rows
 FLOW_NAMES = ("raw", "ego", "obj")
 _MOVING_SPREAD = 3.0
 _JPEG_QUALITY = 80
-_TILE_PX = 480  # the most of a tile of the video, so that two rows of three fit a screen
+_TILE_PX = 480  # largest side of a tile of the video, so that two rows of three fit on a screen
 
 
 class Output:
     """The folder of a job: `<path>.partial` while it runs, `<path>` once it is complete.
 
     Args:
-        settings: the job's, kept in `job.json`.
-        flow_files: formats of flow files, of "flo", "kitti" and "npz".
+        settings: of the job, written to `job.json`.
+        flow_files: formats of flow files: any of "flo", "kitti" and "npz".
         pictures_every: the number of frames from one set of flow pictures to the next; 0 for none.
-        scale_px: the flow of full colour by name, None for 20 each.
-        depth_range_m: the depth at which the video's colours end.
-        moving_px: the least object flow from which a pixel counts as moving by itself.
-        masks: whether a mask of these pixels is written for each frame.
+        scale_px: the flow that has full colour, by name; None is 20 for each.
+        depth_range_m: the depth at the end of the video's colour scale.
+        moving_px: the object flow above which a pixel may count as moving.
+        masks: whether to write a mask of moving pixels for each frame.
         video_fps: None for no video.
     """
 
@@ -59,7 +59,7 @@ class Output:
         for folder in (self.path, self.partial):
             if folder.exists():
                 raise SequenceError(folder, "exists already; remove it, or give another output")
-        if rerun:  # an error before there is a folder
+        if rerun:  # fail before the folder is created
             require("rerun=true", "rerun", "rerun")
         self.flow_files, self.pictures_every, self.moving_px = flow_files, pictures_every, moving_px
         self.scale_px = scale_px or dict.fromkeys(FLOW_NAMES, 20.0)
@@ -84,10 +84,10 @@ class Output:
         if self._rerun is not None:
             self._rerun.append(index, result, pose)
         self.rows.append(score(index, result, moving_px=self.moving_px))
-        append_rows(self.partial / "frames.csv", self.rows[-1:])  # a killed job leaves what is done
+        append_rows(self.partial / "frames.csv", self.rows[-1:])  # a killed job keeps its rows
 
     def close(self) -> None:
-        """Completes the video and the rerun recording; without any frame the folder is removed."""
+        """Completes the video and the rerun recording; removes the folder if there is no frame."""
         for writer in (self._video, self._rerun):
             if writer is not None:
                 writer.close()
@@ -195,16 +195,17 @@ def score(index: int, result: FactorizedFrame, *, moving_px: float) -> dict[str,
         row["rotation_off_deg"] = math.degrees(turn_rad)
         row["translation_off_m"] = float(np.linalg.norm(off[:3, 3]))
     for name, value in row.items():
-        if isinstance(value, float):  # six digits; nothing for what is unknown
+        if isinstance(value, float):  # six digits; an empty cell if unknown
             row[name] = f"{value:.6g}" if math.isfinite(value) else ""
     return row
 
 
 def moves(result: FactorizedFrame, moving_px: float) -> NDArray[np.bool_]:
-    """Returns the pixels that move by themselves `[H, W]`: beyond `moving_px` and the error.
+    """Returns the moving pixels `[H, W]`, whose object flow exceeds `moving_px` and the error.
 
-    Where most of the picture is static, the median of object flow is the error of estimated flow
-    and of poses: 1.18 s, if x and y err by a deviation of s, and one length in 500 exceeds 3.5 s.
+    If most of the picture is static, the median of object flow measures the error of flow and
+    poses. If u and v have errors with a standard deviation of s, the median length is 1.18 s, and
+    one length in 500 exceeds three times that, 3.5 s.
     """
     lengths_px = np.hypot(*result.obj)
     least_px = np.nanmax([moving_px, _MOVING_SPREAD * _median(lengths_px[result.valid])])
@@ -235,7 +236,7 @@ def _median(values: NDArray[np.float32]) -> float:
 
 
 def shown(kind: str, result: FactorizedFrame) -> Flow:
-    """Returns a flow with nan, which is drawn in grey, where it is unknown."""
+    """Returns a flow with nan where it is unknown, which is drawn in grey."""
     if kind == "raw":
         return result.raw
     known = result.ego_valid if kind == "ego" else result.valid
@@ -248,7 +249,8 @@ def video_frame(result: FactorizedFrame, **scales: Any) -> viz.Image:
     height, width = frame.size
     shrink = min(1.0, _TILE_PX / max(height, width))
     size = round(height * shrink), round(width * shrink)
-    # Maps are sampled before they are coloured, which halves the time: pixel centres, as resize.
+    # Maps are sampled (at pixel centres, as in resizing) before they are coloured, which halves the
+    # time.
     rows, columns = (
         ((np.arange(n) + 0.5) * full / n).astype(int) for n, full in zip(size, frame.size)
     )
@@ -262,7 +264,7 @@ def video_frame(result: FactorizedFrame, **scales: Any) -> viz.Image:
 
 
 class RerunExport:
-    """Writes the camera, picture, depth and flow of each frame, to scrub through in 3-D."""
+    """Writes the camera, picture, depth and flow of each frame, for the Rerun viewer."""
 
     def __init__(self, path: Path, scale_px: Mapping[str, float]) -> None:
         import rerun

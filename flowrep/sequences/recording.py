@@ -19,7 +19,7 @@ Pose = NDArray[np.float64]  # world_from_cam [4, 4]
 
 
 class SequenceError(Exception):
-    """A recording that can't be read, in one line that names the file and the cause."""
+    """A recording can't be read; the message is one line that names the file and the cause."""
 
     def __init__(self, path: object, cause: str) -> None:
         super().__init__(f"{path}: {cause}")
@@ -27,22 +27,22 @@ class SequenceError(Exception):
 
 @dataclass(frozen=True)
 class Frame:
-    """One moment of a recording; what it does not have is None.
+    """One frame of a recording; what the recording lacks is None.
 
-    Convention: CONVENTIONS.md's. The camera's axes are OpenCV's, K puts the centre of pixel (0, 0)
-    at (0.5, 0.5), depth is z in metres (nan: missing, inf: no surface), all on one pixel grid.
+    Convention: as in CONVENTIONS.md. The camera's axes are OpenCV's, the centre of pixel (0, 0) is
+    (0.5, 0.5), depth is z in metres (nan: missing, inf: no surface), all on one pixel grid.
 
     Attributes:
         name: unique in the recording; names the files written for the frame.
-        source: the file that is named in errors about the frame.
+        source: the file that errors about the frame name.
         world_from_cam: `[4, 4]`.
         K: `[3, 3]`, pixels.
         depth: `[H, W]`, metres.
         rgb: `[H, W, 3]`.
-        raw: `[2, H, W]`, the recording's own p_t - p_t'; nan where unknown.
-        raw_since: the name of the frame t' that `raw` is measured from, None if it is missing.
-        clip: the number of its shot. There is no flow from one clip to another.
-        position: its number in the recording, in which missing frames count.
+        raw: `[2, H, W]`, the recorded flow p_t - p_t'; nan where unknown.
+        raw_since: the name of the frame t' from which `raw` is measured, None if it is missing.
+        clip: the number of its clip. There is no flow from one clip to another.
+        position: its number in the recording; missing frames count, too.
     """
 
     name: str
@@ -64,7 +64,7 @@ class Frame:
 
 
 class Stream(Protocol):
-    """Frames as they come, from a camera or from a `Recording`; see there for the attributes."""
+    """Frames in order, from a camera or a `Recording`, which explains the attributes."""
 
     has_flow: bool
     has_poses: bool
@@ -74,15 +74,15 @@ class Stream(Protocol):
 
 
 class Recording(ABC):
-    """Frames on disk, read on demand and not kept.
+    """Frames on disk, which are read on demand and not cached.
 
     A reader's constructor and its frames raise `SequenceError` for invalid files and `OSError` for
     missing ones.
 
     Attributes:
-        no_flow: why it has no flow of its own, and what to do.
-        notes: a sentence each, for the user.
-        conventions: the options about conventions that it was opened with, for the diagnosis.
+        no_flow: why there is no recorded flow, and what to do.
+        notes: sentences for the user.
+        conventions: the options about conventions with which it was opened, for the diagnosis.
     """
 
     count: int
@@ -100,7 +100,7 @@ class Recording(ABC):
         """Returns a frame, unchecked."""
 
     def __getitem__(self, index: int) -> Frame:
-        """Returns a frame whose maps have one size and whose K is a camera's."""
+        """Returns a frame, after a check that its maps have one size and K is valid."""
         if not 0 <= index < len(self):
             raise IndexError(f"frame {index} of {len(self)}")
         frame = self._read(index)

@@ -1,4 +1,4 @@
-"""Videos: a webcam or a file, and of a recording with depth its pictures."""
+"""Videos: a webcam or a file, and the pictures of a recording with depth."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class StillVideo:
     """Frames of a camera that does not move, so that all flow is object flow.
 
     The flow of a moving camera can't be factorised without depth, which neither a webcam nor a
-    video file gives: the user has to declare that it is `still`.
+    video file has. The user must confirm that the camera is `still`.
 
     Args:
         source: a camera's number (`0`), or a video file that OpenCV reads.
@@ -43,7 +43,7 @@ class StillVideo:
     def __iter__(self) -> Iterator[Frame]:
         for number, rgb in enumerate(pictures(self._place)):
             height, width = rgb.shape[:2]
-            # A camera that stands still has no ego flow with any depth and any K.
+            # A still camera has no ego flow, whatever depth and K are.
             K = camera_matrix([1.0], (height, width), first_pixel_centre=0.5)
             depth = np.full((height, width), np.inf, dtype=np.float32)
             yield Frame(f"{number:06d}", self.source, np.eye(4), K, depth, rgb)
@@ -72,7 +72,7 @@ class VideoPictures:
         self._next, self._pictures = 0, iter(list[NDArray[np.uint8]]())
 
     def __getitem__(self, index: int) -> NDArray[np.uint8]:
-        """Returns a picture; one before the last that was read starts again from the first."""
+        """Returns a picture; to go back, it reads the file again from the start."""
         # Not OpenCV's seeking, which misses the picture in some codecs.
         if self._next == 0 or index < self._next:
             self._next, self._pictures = 0, pictures(str(self.path))

@@ -305,7 +305,7 @@ def test_states_pass_between_workers_and_one_process(make, noise):
     alone = make(seed=0)
     _, then = play(alone, actions[:20])
     states, then = get_states(alone), then.clone()
-    with pytest.raises(ValueError, match="1 states for 3 environments"):
+    with pytest.raises(ValueError, match="1 states for 3 envs"):
         set_states(alone, states[:1])
     expected, _ = play(alone, actions[20:], then.clone())
     shared = make(seed=99, num_workers=2)
