@@ -63,7 +63,7 @@ def show(table: Table, title: str) -> None:
     from rich.console import Console
     from rich.text import Text
 
-    heading = Text(title, style="table.title")  # rich takes brackets in a str for markup
+    heading = Text(title, style="table.title")  # rich reads brackets in a str as markup
     shown = rich.table.Table(title=heading, box=rich.box.SIMPLE, pad_edge=False)
     for name, side in zip(table.header, table.alignment):
         shown.add_column(Text(name), justify="left" if side == "l" else "right", no_wrap=True)

@@ -19,8 +19,8 @@ from matplotlib.patches import Patch
 from flowrep.report.runs import SCENES, Curve, SuccessGrid, mean_curve
 from flowrep.report.statistics import Estimate
 
-# Okabe and Ito's colours for single maps and for the two flows. Flows with another map are darker,
-# in that map's hue, and have a hatch or a dashed line.
+# Okabe and Ito's colours for single maps and for ego + object flow. Flows with another map have a
+# darker colour of that map's hue, and a hatch or a dashed line.
 _COLOURS = {
     "ego": "#e69f00",
     "raw": "#56b4e9",
@@ -34,7 +34,7 @@ _COLOURS = {
 }
 _ADDED = {"ego+obj+seg2": "////", "ego+obj+depth2": "\\\\\\\\", "ego+obj+seg2+depth2": "xxxx"}
 _OTHERS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
-_CONFIG_HATCHES = ("", "......", "++++", "||||")  # of the configs of one stack
+_CONFIG_HATCHES = ("", "......", "++++", "||||")  # for several configs of one stack
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "p")
 _TEXT, _FAINT = "#1b1f24", "#6b7480"
 
@@ -66,11 +66,11 @@ class Look(NamedTuple):
 
 
 def looks(names: Sequence[str]) -> dict[str, Look]:
-    """Returns how the series of a figure are drawn; a series is "ego" or, of a config, "ego, x"."""
+    """Returns how the series of a figure are drawn; a series is "ego", or "ego, x" for a config."""
     parts = [name.partition(", ")[::2] for name in names]
     stacks, configs = ([*dict.fromkeys(part)] for part in zip(*parts))
-    # The paper's stacks look the same in all figures. If there is another, colours are dealt out
-    # in turn, so that no two stacks look alike.
+    # The paper's stacks look the same in all figures. If there is another stack, colours are
+    # assigned in turn, so that no two stacks look alike.
     are_known = {*stacks} <= {*_COLOURS}
     colours = _COLOURS if are_known else dict(zip(stacks, cycle(_OTHERS)))
     by_name = {}
@@ -83,7 +83,7 @@ def looks(names: Sequence[str]) -> dict[str, Look]:
 
 
 def words(name: str) -> str:
-    """Returns a name from a config as a heading, the paper's scenes as the paper spells them.
+    """Returns a name from a config as a heading; the paper's scenes are spelt as in the paper.
 
     >>> words("s_turn"), words("my_crossing")
     ('S-Turn', 'My crossing')
@@ -93,7 +93,7 @@ def words(name: str) -> str:
 
 
 def styled(font_pt: float = 7.5) -> AbstractContextManager[None]:
-    """Returns the context that draws figures in one style."""
+    """Returns a context in which all figures have the same style."""
     settings: Any = {
         "font.size": font_pt,
         "axes.titlesize": font_pt + 0.5,
@@ -111,7 +111,7 @@ def styled(font_pt: float = 7.5) -> AbstractContextManager[None]:
 
 
 def encoded(figure: Figure, kind: str, dpi: int = 300) -> bytes:
-    """Returns a figure as "png", "pdf" or "svg", the same bytes whenever it is drawn."""
+    """Returns a figure as "png", "pdf" or "svg"; equal figures give equal bytes."""
     data = io.BytesIO()
     undated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(kind)
     # Type 42 keeps text as text; the salt makes an SVG's ids the same every time.
@@ -145,7 +145,8 @@ def draw_rates(grids: Sequence[SuccessGrid]) -> Figure:
 def draw_curves(panels: Sequence[tuple[str, Mapping[str, Sequence[Curve]]]]) -> Figure:
     """Returns learning curves, a panel per scene.
 
-    Bold is the seeds' mean in evaluations, thin each seed's training episodes.
+    Bold lines are the mean of evaluations over seeds, thin lines the training episodes of each
+    seed.
     """
     style = looks(list(dict.fromkeys(name for _, curves in panels for name in curves)))
 
@@ -181,7 +182,7 @@ def _panels(
         longest = max(len(handle.get_label()) for handle in handles)
         entry_in = (0.5 * longest + 3.5) * em_in  # half an em a letter, 3.5 for the sign and gaps
         beside = min(len(handles), max(1, int(width / entry_in)))
-        # matplotlib fills a legend column by column; people read row by row
+        # matplotlib fills a legend column by column, but people read row by row
         by_column = [handle for start in range(beside) for handle in handles[start::beside]]
         gaps = {"handlelength": 1.8, "columnspacing": 1.2, "handletextpad": 0.5}
         figure.legend(handles=by_column, loc="outside upper center", ncols=beside, **gaps)

@@ -1,6 +1,6 @@
-"""One self-contained HTML page of a report, with the drives and films that evaluations saved.
+"""A self-contained HTML page of a report, with the drives and films that evaluations saved.
 
-`RunFolder`, which writes drives.npz, says what is in it.
+`RunFolder`, which writes drives.npz, describes its content.
 """
 
 import base64
@@ -41,7 +41,7 @@ class EmbeddedPicture(NamedTuple):
 
 
 class Drives(NamedTuple):
-    """Plans by scene, films by episode, and a warning for each run that lacks one."""
+    """Plans by scene, films by episode, and a warning for each run without them."""
 
     plans: dict[str, list[EmbeddedPicture]]
     films: dict[str, list[EmbeddedPicture]]
@@ -52,7 +52,7 @@ def drives_of(runs: Sequence[Run], *, trajectories: int, videos: int) -> Drives:
     """Returns a plan of drives, and films, of one agent of each group, scene and stack.
 
     Args:
-        runs: of which those with the lowest seed are shown.
+        runs: the runs; those with the lowest seed are shown.
         trajectories: the number of drives in a plan.
         videos: the number of films of an agent.
     """
@@ -109,7 +109,7 @@ def tracks_of(run: Run, count: int) -> list[Track]:
 
 
 def films_of(run: Run) -> list[Path]:
-    """Returns the films in a run's folder, without links that lead out of it."""
+    """Returns the films in a run's folder, except links to files outside of it."""
     if run.folder is None:
         return []
     home, films = run.folder.resolve(), sorted(run.folder.glob("videos/*.mp4"))

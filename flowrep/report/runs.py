@@ -1,4 +1,4 @@
-"""Runs as a report sees them: which may be compared, and the success of their episodes."""
+"""Runs for a report: which of them may be compared, and the success of their episodes."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -28,7 +28,7 @@ COMPLEMENTARY_STACKS = (
 STACKS = tuple(dict.fromkeys(FLOW_STACKS + COMPLEMENTARY_STACKS))
 BASELINES = ("never_turn", "random", "planner", "speed_blind")
 _REPRESENTATIONS = ("raw", "ego", "obj", "seg", "seg2", "depth", "depth2", "rgb")
-_OF_EVERY_SCENE = ("camera", "frame_rate_hz")  # keys of a scene that scenes share
+_OF_EVERY_SCENE = ("camera", "frame_rate_hz")  # keys whose values are the same in all scenes
 
 
 class Condition(NamedTuple):
@@ -65,7 +65,7 @@ class Run:
 
     @cached_property
     def tested(self) -> NDArray[np.bool_]:
-        """Whether each episode was driven by the finished agent, in the scene of its training."""
+        """Which episodes the finished agent drove in the scene of its training."""
         e = self.episodes
         here = e["scene"] == self.scene
         while_training = e["scene_id"][here & (e["evaluation"] != "evaluate")]
@@ -88,10 +88,10 @@ class Run:
 
 
 def _settings(config: Mapping[str, Any]) -> dict[str, str]:
-    """Returns all that the weights depend on but the seed, by dotted key.
+    """Returns everything but the seed on which the weights depend, by dotted key.
 
-    Keys of a single scene are under the scene's name, as options of a representation are under its
-    name, so that only runs which have them can differ in them.
+    Keys of a single scene are under the scene's name, and options of a representation under its
+    name, so that only runs that have them can differ in them.
     """
     parts = origin_of(config) | {"total_frames": config["total_frames"]}
     del parts["flowrep"], parts["seed"]
@@ -123,7 +123,7 @@ def in_order(names: Iterable[str], known: Sequence[str]) -> list[str]:
 
 
 def stack_of(representations: Iterable[str]) -> str:
-    """Returns the name of a set of representations, whatever their order."""
+    """Returns the name of a stack, a set of representations, whatever their order."""
     return "+".join(in_order(representations, _REPRESENTATIONS))
 
 
@@ -178,9 +178,9 @@ def success_rate(outcomes: Sequence[NDArray[Any]]) -> float:
 
 
 def departures(outcomes: Sequence[NDArray[Any]]) -> float:
-    """Returns departures from the road as a share of departures and collisions; nan without any.
+    """Returns departures from the road as a share of departures and collisions, nan without both.
 
-    It is the paper's Table III.
+    This is the paper's Table III.
     """
     ends = np.concatenate(outcomes)
     out, hit = (ends == "out_of_bounds").sum(), (ends == "collision").sum()
@@ -204,8 +204,8 @@ def paired_scores(
 ) -> tuple[list[Array], int] | None:
     """Returns the score of each run of each side, over the episodes that all of them drove.
 
-    An episode's difficulty is thus no part of a difference. The second value is the number of
-    those episodes; without any, the result is None. Runs that lack a condition are left out.
+    Differences then don't depend on the difficulty of episodes. The second value is the number of
+    these episodes; without any, the result is None. Runs that lack a condition are left out.
     """
     ours = [[run for run in side if run.conditions.issuperset(conditions)] for side in sides]
     if not all(ours):
@@ -233,12 +233,12 @@ def changes(runs: Iterable[Run], before: Condition, after: Condition) -> Array:
 
 
 def baseline_share(runs: Iterable[Run], condition: Condition) -> float | None:
-    """Returns the success rate of a baseline, the condition's policy; None if it did not drive."""
+    """Returns the success rate of a baseline (the condition's policy), None if it did not drive."""
     driven = [run.under(condition) for run in runs]
     seeds, outcomes = (
         np.concatenate([c[name] for c in driven]) for name in ("episode_seed", "outcome")
     )
-    # A baseline drives an episode the same way beside any agent, so each episode counts once.
+    # A baseline drives an episode in the same way in every run, so each episode counts once.
     _, first = np.unique(seeds, return_index=True)
     return success_rate([outcomes[first]]) if len(first) else None
 

@@ -107,7 +107,7 @@ def write_files(report: Report, folder: Path) -> list[Path]:
 
 
 def _unusable(run: Run, policy: str) -> str | None:
-    """Returns why a run is in no table, None if it is."""
+    """Returns why a run is in no table, None if it is in one."""
     unused = "only its learning curve is used"
     if not run.is_finished:
         reached = f"{run.frames:,} of {run.total_frames:,} frames"
@@ -138,8 +138,8 @@ def _group_sections(group: Group, policy: str) -> list[ReportSection]:
     return [*sections, *_curves(group.runs)]
 
 
-# Runs of a group differ only in scene, stack and seed, so the first one's speed and frame rate are
-# those of all.
+# Runs of a group differ only in scene, stack and seed, so all have the first run's speed and frame
+# rate.
 def _rates(runs: Sequence[Run], policy: str) -> list[float]:
     asked = (policy, runs[0].speed)
     return sorted({c.fps for run in runs for c in run.conditions if c[:2] == asked})
@@ -237,8 +237,9 @@ def _differences_table(
     caption = (
         "First minus second in percentage points, on the episodes that all runs of both drove, "
         "with 95 % intervals and p of Welch's t-test over seeds; p (Holm) is corrected for the "
-        "comparisons of its block, and a difference counts if it is below 0.05. P(first better) "
-        "is how often a run of the first beats one of the second; a tie counts half."
+        "comparisons of its block, and a difference is significant if it is below 0.05. "
+        "P(first better) is how often a run of the first beats one of the second; "
+        "a tie counts half."
     )
     if len(chosen) < len(asked):
         caption += f" The first {len(chosen)} of {len(asked)} pairs."
@@ -259,7 +260,7 @@ def _failure_section(runs: Sequence[Run], policy: str) -> ReportSection:
         rows = [(stack, *_failure_cells(here.get(stack, []), conditions)) for stack in stacks]
         blocks.append((words(scene), tuple(rows)))
     caption = (
-        "Causes of failure in % of a run's collisions and departures from the road together, "
+        "Causes of failure in % of all collisions and departures from the road of a run, "
         f"without time-outs: {INTERVALS}. {words(' and '.join(speeds))} speed, {fps:g} frames per "
         f"second, {policy} actions."
     )
@@ -300,7 +301,7 @@ def _rate_section(runs: Sequence[Run], policy: str) -> ReportSection:
             rows.append((name, *_shares(grid, name), loss))
         blocks.append((words(grid.scene), tuple(rows)))
     caption = (
-        f"Success over the frame rate of the evaluation, trained at {trained:g} frames per second, "
+        f"Success by frame rate of the evaluation, trained at {trained:g} frames per second, "
         f"{speed} speed, {policy} actions: {INTERVALS}. Points at one rate are side by side."
     )
     heads = (*(f"{c.fps:g} Hz (%)" for c in conditions), f"{high.fps:g} → {low.fps:g} Hz (points)")
@@ -320,14 +321,14 @@ def _curves(runs: Sequence[Run]) -> list[ReportSection]:
     if not panels:
         return []
     caption = (
-        "Learning curves. Bold, with markers: greedy evaluations at the training speed, the mean "
-        "over seeds. Thin: each seed's training episodes, sampled actions."
+        "Learning curves. Bold lines with markers: greedy evaluations at the training speed, mean "
+        "over seeds. Thin lines: training episodes of each seed, with sampled actions."
     )
     return [ReportSection("learning_curves", "Learning curves", (), draw_curves(panels), caption)]
 
 
 def _configs_section(groups: Sequence[Group], policy: str) -> ReportSection:
-    # Stacks with runs of several configs, side by side and never pooled.
+    # Stacks with runs of several configs are shown side by side and never pooled.
     keys = dict.fromkeys(key for group in groups for key in group.differences)
     labels = [group.label for group in groups]
     are_short = all(0 < len(label) <= _LONGEST_LABEL for label in labels)

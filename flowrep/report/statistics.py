@@ -1,12 +1,12 @@
 """Statistics of the success of a few runs: means with t intervals, Welch's test, Holm's correction.
 
-The unit is the run. Episodes of one run share its weights, so hundreds of them say little about
-what another seed would have learned; a run therefore counts with one number, its success rate.
-Rates are arrays `[R]`, one for each side of a comparison and each scene. All scenes have the same
-weight in a mean over scenes; else a side with more seeds in the easier scene would look better.
+The unit is the run. All episodes of a run share its weights, so even hundreds of them say little
+about what another seed would have learned. A run therefore counts as one number, its success rate.
+Rates are arrays `[R]`, one for each scene and each side of a comparison. In a mean over scenes, all
+scenes have the same weight; otherwise a side with more seeds in the easier scene would look better.
 
-With few runs a t interval is wide. A bootstrap over the same runs is too narrow: with five runs it
-covers the mean in 84 % of cases instead of 95.
+With few runs, a t interval is wide. A bootstrap over the same runs would be too narrow: with five
+runs it covers the mean in 84 % of cases instead of 95 %.
 """
 
 from collections.abc import Sequence
@@ -40,14 +40,14 @@ class Effect(NamedTuple):
 
     @property
     def p_value(self) -> float:
-        """Two-sided p of no difference; nan if the runs show no spread to compare it with."""
+        """Two-sided p of no difference; nan if the runs don't spread, so that p is unknown."""
         if self.error == 0:
             return 1.0 if self.value == 0 else float("nan")
         return float(2 * stats.t.sf(abs(self.value) / self.error, self.freedom))
 
     def p_within(self, margin: float) -> float:
         """Returns p of two one-sided tests that the difference is smaller than a margin."""
-        # The larger p of the two is that of the test against the nearer end of the margin.
+        # The result is the larger p of the two tests: the one against the nearer end of the margin.
         nearer = self._replace(value=abs(self.value) - margin)
         return nearer.p_value / 2 if nearer.value < 0 else 1 - nearer.p_value / 2
 
@@ -75,9 +75,9 @@ class Effect(NamedTuple):
         """Returns whether a claim "holds", is "contradicted", `UNSEEN` or "can't be tested".
 
         Args:
-            expect: what is claimed of the difference: "more" or "less" than 0, or "equal".
-            p_value: corrected p of the claim's test; `p_within` the margin for "equal".
-            p_against: corrected p `p_beyond` the margin, which contradicts "equal".
+            expect: the claim about the difference: "more" or "less" than 0, or "equal".
+            p_value: corrected p of the claim's test; for "equal", of `p_within` the margin.
+            p_against: corrected p of `p_beyond` the margin, which contradicts "equal".
         """
         if np.isnan(p_value):
             return "can't be tested"
@@ -88,14 +88,16 @@ class Effect(NamedTuple):
 
 
 def effect(scenes: Sequence[Sequence[Array]]) -> Effect:
-    """Returns the mean over scenes of a side's mean, minus that of the second side if there is one.
+    """Returns the mean over scenes of the first side's mean, minus that of a second side, if any.
 
-    With S scenes and the variances s² of the R runs of each scene and side, the standard error is
-    sqrt(Σ s² / R) / S, and the degrees of freedom are (Σ s²/R)² / Σ ((s²/R)² / (R - 1)): Welch's
-    test with Satterthwaite's approximation. Variances are not pooled, because some stacks end in
-    one of two ways and spread far more than others.
+    Each scene has one or two sides, arrays `[R]` of rates. With S scenes and the variances s² of
+    the R runs of each scene and side, the standard error is sqrt(Σ s²/R) / S, and the degrees of
+    freedom are (Σ s²/R)² / Σ ((s²/R)² / (R - 1)): Welch's test with Satterthwaite's approximation.
+    Variances are not pooled, because the runs of some stacks either succeed or fail and spread far
+    more than those of others.
     """
     means = [side[0].mean() - (side[1].mean() if len(side) > 1 else 0.0) for side in scenes]
+    # s²/R and R - 1 of each scene and side with more than one run
     parts = [(s.var(ddof=1) / len(s), len(s) - 1) for side in scenes for s in side if len(s) > 1]
     if len(parts) < sum(map(len, scenes)):
         return Effect(float(np.mean(means)), float("nan"), float("nan"))
@@ -105,9 +107,9 @@ def effect(scenes: Sequence[Sequence[Array]]) -> Effect:
 
 
 def permuted_p(scenes: Sequence[Sequence[Array]], draws: int = 20_000) -> float:
-    """Returns the two-sided p of no difference, by exchanging runs between the sides of each scene.
+    """Returns the two-sided p of no difference, by permuting runs between the sides of each scene.
 
-    It assumes nothing of how runs spread, so it holds where a few of them end far from the others.
+    It makes no assumption about the distribution of rates, so it is valid with outliers, too.
     """
     rng = np.random.default_rng(0)
     totals = np.zeros(draws)
@@ -115,7 +117,7 @@ def permuted_p(scenes: Sequence[Sequence[Array]], draws: int = 20_000) -> float:
         dealt = rng.permuted(np.tile(np.concatenate([first, second]), (draws, 1)), axis=1)
         totals += dealt[:, : len(first)].mean(axis=1) - dealt[:, len(first) :].mean(axis=1)
     seen = abs(effect(scenes).value)
-    # the deal that was seen is one of those that are possible
+    # The observed assignment is one of the possible permutations, hence 1 + ... in both counts.
     return float((1 + (abs(totals / len(scenes)) >= seen - 1e-9).sum()) / (1 + draws))
 
 
@@ -123,7 +125,8 @@ def mean_share(scenes: Sequence[Array], episodes: int = 0) -> Estimate:
     """Returns the mean of rates over a scene's runs, averaged over scenes.
 
     A single run, or runs with equal rates, show no spread between seeds. If `episodes`, the number
-    behind a rate, is given, they get Wilson's interval, which says nothing about other seeds.
+    of episodes behind a rate, is given, the interval is then Wilson's over episodes, which says
+    nothing about other seeds.
     """
     mean = effect([(rates,) for rates in scenes])
     if episodes and not mean.error > 0:
@@ -135,6 +138,7 @@ def mean_share(scenes: Sequence[Array], episodes: int = 0) -> Estimate:
 
 def improvement(scenes: Sequence[Sequence[Array]]) -> float:
     """Returns how often a run of the first side beats one of the second; a tie counts half."""
+    # [R, 1] against [1, R], all pairs of runs of a scene
     pairs = [(ours[:, None], theirs[None]) for ours, theirs in scenes]
     return float(np.mean([((a > b) + 0.5 * (a == b)).mean() for a, b in pairs]))
 
@@ -142,8 +146,9 @@ def improvement(scenes: Sequence[Sequence[Array]]) -> float:
 def holm(p_values: Sequence[float]) -> list[float]:
     """Returns p values corrected for their number by Holm's method; nan stays nan.
 
-    The k-th smallest of n (from 0) is multiplied by n - k; no value may be below the one before
-    it, or a larger p would be the surer. scipy has no Holm.
+    The k-th smallest of n (from 0) is multiplied by n - k. A corrected value must not be below the
+    previous one; otherwise a larger p could become significant before a smaller one. scipy has no
+    function for Holm's method.
     """
     known = sorted((p, i) for i, p in enumerate(p_values) if not np.isnan(p))
     corrected, largest = list(p_values), 0.0

@@ -2,9 +2,9 @@
 
     python -m flowrep.report.storage outputs/<sweep> ... --into outputs/reference
 
-Packed, `runs.jsonl` has a line per run: its name, commit, precision, CPU and config.
-`episodes.csv.gz` has a row per evaluated episode, with the columns of `EpisodeRecord` that neither
-config nor outcome imply; `training.csv.gz` has a row per logged step.
+Packed runs are three tables. `runs.jsonl` has a line per run: its name, commit, precision, CPU and
+config. `episodes.csv.gz` has a row per evaluated episode, with the columns of `EpisodeRecord` that
+don't follow from config and outcome. `training.csv.gz` has a row per row of metrics.csv.
 """
 
 import argparse
@@ -45,8 +45,8 @@ _EPISODES = {
 def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
     """Returns the runs in folders at any depth, and a warning for each that was left out.
 
-    A folder of packed tables stands for all of its runs, or with a pattern after its name, such as
-    `outputs/reference/s_turn_*`, for the runs whose names match.
+    A folder of packed tables means all of its runs. With a pattern after its name, such as
+    `outputs/reference/s_turn_*`, it means the runs whose names match.
     """
     runs: dict[str, Run] = {}  # by path, so that a folder given twice counts once
     warnings: list[str] = []
@@ -61,7 +61,7 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
         paths = [config.parent for config in sorted(folder.rglob("config.yaml"))]
         paths = [p for p in paths if {".hydra", "wandb"}.isdisjoint(p.relative_to(folder).parts)]
         if not paths:
-            what = "holds no run" if folder.exists() else "does not exist"
+            what = "contains no run" if folder.exists() else "does not exist"
             raise RunFolderError(f"'{folder}' {what}. Give the folder of a run or of a sweep")
         for path in paths:
             try:
@@ -90,9 +90,9 @@ def read_run(path: Path) -> Run:
 
 
 def without_repeats(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
-    """Returns one run per config and seed, and a warning for each other one.
+    """Returns one run per config and seed, the one with the most tested episodes.
 
-    Of several, the run with the most tested episodes is kept.
+    The second value has a warning for each run that is left out.
     """
     kept: dict[Any, Run] = {}
     warnings = []
@@ -110,7 +110,7 @@ def episode_columns(cells: Cells) -> Columns:
     columns: Columns = {
         name: np.array(cells.get(name, empty), kind) for name, kind in _EPISODES.items()
     }
-    # A misspelt success would count as a failure.
+    # A misspelt "success" would count as a failure.
     unknown = {*columns["outcome"].tolist()} - {*OUTCOMES}
     if unknown:
         names = ", ".join(map(repr, sorted(unknown)))
@@ -123,7 +123,7 @@ def _metric_columns(cells: Cells) -> Columns:
 
 
 def _machine(path: Path) -> dict[str, str]:
-    # A run that was resumed on another machine has several.
+    # A run that was resumed on another machine has several machines.
     try:
         machines = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
         values = {key: dict.fromkeys(str(each.get(key)) for each in machines) for key in _MACHINE}
@@ -158,7 +158,7 @@ def read_archive(folder: Path, pattern: str = "*") -> list[Run]:
 
 
 def _of_runs(path: Path) -> dict[str, Cells]:
-    # By columns: a dict for each of some 400,000 rows would take seconds.
+    # Read by columns, because a dict for each of about 400,000 rows would take seconds.
     with gzip.open(path, "rt", encoding="utf-8", newline="") as file:
         lines = csv.reader(file)
         names = next(lines)[1:]
@@ -167,7 +167,7 @@ def _of_runs(path: Path) -> dict[str, Cells]:
 
 
 def write_archive(runs: Sequence[Run], folder: Path) -> None:
-    """Adds runs to a folder of packed runs, in place of those of the same names.
+    """Adds runs to a folder of packed runs, and replaces those with the same names.
 
     The same runs give the same bytes.
     """

@@ -20,7 +20,7 @@ _LATEX: dict[str, str] = {character: rf"\{character}" for character in "&%$#_{}"
 
 
 class Table(NamedTuple):
-    """Text in rows, which stand in blocks."""
+    """A table of texts; its rows are grouped in blocks."""
 
     name: str  # of its files
     caption: str

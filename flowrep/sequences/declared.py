@@ -114,7 +114,7 @@ class DeclaredRecording(Recording):
         left_out |= self._read_poses() | self._read_intrinsics()
         self.has_flow, self.no_flow = self._flow_fits()  # now that the lens is known
         if unknown := {*self.leave_out} - {*self._names}:
-            raise SequenceError("leave_out", f"names frame {min(unknown)}, which isn't there")
+            raise SequenceError("leave_out", f"names frame {min(unknown)}, which doesn't exist")
         left_out["in format.leave_out"] = np.isin(self._names, list(self.leave_out))
         self._choose(left_out)
         self._made: dict[Any, tuple[Any, Any]] = {}
@@ -165,7 +165,7 @@ class DeclaredRecording(Recording):
                 found = {Path(name).stem: self.folder / name for _, name in lines}
                 times = [float(time) for time, _ in lines]
                 if len(found) < len(times):
-                    raise ValueError("two pictures have one name")
+                    raise ValueError("two pictures have the same name")
         except (ValueError, FileNotFoundError) as error:
             remedy = f"give the folder whose {path.name} has '<time> <file>' in each line"
             says = "is missing" if isinstance(error, FileNotFoundError) else error

@@ -78,7 +78,7 @@ def recorded_flow(previous: Frame, current: Frame) -> Flow:
         raise SequenceError(current.source, "has no flow of its own: use flow=estimated")
     if current.raw_since != previous.name:
         since = current.raw_since or "that is missing"
-        cause = f"has flow since frame {since}, and here follows {previous.name}"
+        cause = f"its flow is measured from frame {since}, but the previous one is {previous.name}"
         remedy = "use flow=estimated, or stride=1 and a recording without gaps"
         raise SequenceError(current.source, f"{cause}: {remedy}")
     return current.raw

@@ -69,7 +69,7 @@ def with_suffix(path: Path, kind: str) -> Path:
 def regular(path: Path) -> Path:
     """Returns a path, unless it is a pipe, from which reading might never end."""
     if path.exists() and not path.is_file():
-        raise SequenceError(path, "is no file")
+        raise SequenceError(path, "is not a regular file")
     return path
 
 

@@ -54,7 +54,7 @@ class Kitti(Recording):
         if raw_data is None:
             return
         if mapping is None:
-            raise SequenceError(raw_data, "is of no use without format.mapping=train_mapping.txt")
+            raise SequenceError(raw_data, "needs format.mapping=train_mapping.txt, too")
         self._oxts = {}  # the folder of GPS and IMU packets and the frame number, by pair
         for pair, line in enumerate(
             files.regular(Path(mapping)).read_text("utf-8-sig").splitlines()

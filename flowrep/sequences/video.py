@@ -57,7 +57,7 @@ def pictures(source: int | str) -> Iterator[NDArray[np.uint8]]:
             picture = capture.read()[1]
             if picture is None:
                 if number == 0:
-                    raise SequenceError(source, "OpenCV reads no picture of it as a video")
+                    raise SequenceError(source, "OpenCV can't read it as a video")
                 return
             yield np.ascontiguousarray(picture[..., ::-1])
     finally:

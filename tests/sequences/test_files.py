@@ -156,7 +156,7 @@ MISTAKES = [
     ("tum", "groundtruth.txt", ["1.0 0 0 0"], "expected 7, 12"),
     ("tum", "depth.txt", ["1.0"], "<time> <file>"),
     ("tum", "depth.txt", ["# none"], "depth.txt"),
-    ("tum", "depth.txt", ["1 depth/a.png", "2 depth/a.png"], "one name"),
+    ("tum", "depth.txt", ["1 depth/a.png", "2 depth/a.png"], "same name"),
     ("sintel", "camdata_left/cave/frame_0001.cam", bytes(60), "no table"),
     ("sevenscenes", "frame-000001.pose.txt", ["1 0 0 0"], "4 numbers"),
     ("kitti", "train_mapping.txt", ["2011_09_26 drive"], "2011_09_26 drive"),
