@@ -399,7 +399,7 @@ class _Body:
         if base[10] == _RIGID and len(client.getVisualShapeData(number)) > 1:
             raise ValueError(
                 f"body {number} ({self.name}) was loaded with useMaximalCoordinates: PyBullet "
-                "draws its links under one id and doesn't tell where they are; load it without"
+                "draws its links under one id and doesn't report their poses; load it without"
             )
         self.is_soft = base[10] == _SOFT
         links = range(0 if self.is_soft else client.getNumJoints(number))

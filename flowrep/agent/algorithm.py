@@ -59,7 +59,7 @@ class Algorithm(ABC):
     """Whether `losses` and `after_update` can be part of a CUDA graph, see `as_cuda_graph`."""
 
     WRITES_LOG_PROB: ClassVar[bool] = False
-    """Whether `policy` writes `action_log_prob` beside `action`."""
+    """Whether `policy` writes `action_log_prob` in addition to `action`."""
 
     policy: Any
     memory: Any
@@ -178,7 +178,7 @@ class Algorithm(ABC):
         return {}
 
     def other_weights(self) -> Mapping[str, Tensor]:
-        """Returns tensors that training changes besides the weights of the loss, by name."""
+        """Returns tensors that training changes in addition to the loss's weights, by name."""
         return {}
 
     def after_update(self) -> None:

@@ -237,7 +237,7 @@ def check_flow_options(direction: str, grid: str, channels: str) -> None:
         raise ValueError(
             f"{direction} flow on the previous frame's grid can't be converted exactly to the "
             "current frame's grid: pixels that were covered have no vector, and where several move "
-            "to the same pixel only depth tells which one is seen. Compute flow from the current "
+            "to the same pixel, depth decides which one is seen. Compute flow from the current "
             "frame to the previous one (with most estimators: swap the two pictures) and adapt it "
             "with direction='backward', grid='current'"
         )

@@ -49,7 +49,7 @@ _OF_ADDED = (
 )  # fmt: skip
 _EXPERIMENTS = (
     ("flow_composition", "Composition of the flow maps", FLOW_STACKS, _OF_FLOWS),
-    ("complementary", "Flow beside segmentation and depth", COMPLEMENTARY_STACKS, _OF_ADDED),
+    ("complementary", "Flow with segmentation and depth", COMPLEMENTARY_STACKS, _OF_ADDED),
 )
 _TABLE_III = ("ego+obj", "depth2", "seg2", "ego+obj+depth2", "ego+obj+seg2", _ALL)
 

@@ -74,7 +74,7 @@ def flow_to_rgb(flow: Any, scale_px: float) -> Image:
 
     Convention: right is red, down is yellow-green, left is cyan, up is violet. Saturation is the
     square root of magnitude over `scale_px`, clipped at 1, so that a tenth of a pixel is visible
-    beside tens of pixels. Flow that is not finite is grey.
+    next to tens of pixels. Flow that is not finite is grey.
 
     Args:
         flow: `[2, H, W]`, (u right, v down), pixels.
@@ -220,7 +220,7 @@ def representation_strip(
 
 @lru_cache(maxsize=64)
 def class_legend(names: tuple[str, ...], width: int) -> Image:
-    """Returns the classes' colours beside their names, in as many rows as the width needs."""
+    """Returns the colours and names of classes, in as many rows as the width needs."""
     columns = max(1, width // _CLASS_PX)
     legend = np.full((-(-len(names) // columns) * _NOTE_PX, width, 3), 255, np.uint8)
     texts = {}
@@ -259,7 +259,7 @@ def strip(
 
     Args:
         images: by label, `[H, W, 3]`.
-        wheel_for: labels with the flow wheel beside them.
+        wheel_for: labels that have the flow wheel next to them.
         notes: by label, the note below it: a text, or a function from a width to a legend.
         framed: labels with a frame around label and image.
 

@@ -109,7 +109,7 @@ def _draw_solids(axes: Axes, layout: Layout, path: str | None) -> dict[str, Any]
 
 
 def _draw_zones(axes: Axes, layout: Layout) -> list[Any]:
-    # Each zone has its name beside the road, and starts have an arrow in the direction of travel.
+    # Each zone has its name next to the road; starts have an arrow in the direction of travel.
     scene, named = layout.scene, set[str]()
     starts = {path.start for path in scene.paths}
     for kind, colour in _ZONE_COLOURS.items():
