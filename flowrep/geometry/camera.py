@@ -27,7 +27,7 @@ def project(points_cam: Tensor, K: Tensor) -> Tensor:
     Equation 9 of the paper, with separate focal lengths and skew.
 
     Args:
-        points_cam: `[*B, ..., 3]`, metres, in the camera's frame.
+        points_cam: `[*B, ..., 3]`, metres, in camera coordinates.
         K: `[*B, 3, 3]`; its batch dims are the leading dims of `points_cam`.
 
     >>> K = torch.tensor([[100.0, 0.0, 32.0], [0.0, 50.0, 24.0], [0.0, 0.0, 1.0]])
@@ -48,7 +48,7 @@ def project(points_cam: Tensor, K: Tensor) -> Tensor:
 
 
 def unproject(depth: Tensor, K: Tensor) -> Tensor:
-    """Returns the point that each pixel shows, in the camera's frame, `[*B, H, W, 3]`.
+    """Returns the point that each pixel shows, in camera coordinates, `[*B, H, W, 3]`.
 
     Convention: as in `project`. Depth is z along the optical axis (not the ray's length), and the
     pixel in column i, row j is seen through its centre (i + 0.5, j + 0.5). Where depth is inf or
@@ -203,6 +203,6 @@ def check_intrinsics(
             f"{where} can't belong to a picture {width} px wide and {height} px high: fx and fy "
             f"should be {SHORTEST * side:g} to {LONGEST * side:g} px, cx "
             f"{BORDER * width:g} to {(1 - BORDER) * width:g}, cy {BORDER * height:g} to "
-            f"{(1 - BORDER) * height:g}; got {K[index].tolist()}. If it is of a picture of another "
-            "size, or divided by the size, scale its first two rows"
+            f"{(1 - BORDER) * height:g}; got {K[index].tolist()}. If it is for another picture "
+            "size, or was divided by the size, scale its first two rows"
         )

@@ -129,9 +129,9 @@ def camera_motion(
     """Returns the camera's motion between two frames of a mostly static world.
 
     Convention: `flow` is p_t - p_t' per step on the current frame's grid, that of `rigid_flow` or
-    an estimator's, and `prev_from_curr` takes a point from the current camera's frame into the
-    previous camera's, so that `ego_flow(depth, K, prev_from_curr)` is the flow of the static world.
-    The result depends on the frame alone (random draws are fixed) and has no gradient.
+    an estimator's, and `prev_from_curr` transforms a point from the current camera's coordinates to
+    the previous camera's, so that `ego_flow(depth, K, prev_from_curr)` is the flow of the static
+    world. The result depends on the frame alone (random draws are fixed) and has no gradient.
 
     Flow estimated on plain surfaces is a guess, or 0. With `picture`, each residual is weighted by
     the local structure tensor: it has no weight without texture, and at an edge only its component

@@ -68,8 +68,8 @@ def ego_flow(
     Args:
         depth: `[*B, 1, H, W]`, metres along the optical axis.
         K: `[*B, 3, 3]`, rows (fx, skew, cx), (0, fy, cy), (0, 0, 1), pixels.
-        prev_from_curr: `[*B, 4, 4]`, rigid, metres; takes a point in the current camera's frame
-            into the previous camera's.
+        prev_from_curr: `[*B, 4, 4]`, rigid, metres; transforms a point from the current camera's
+            coordinates to the previous camera's.
         prev_K: K of the previous frame, `[*B, 3, 3]`, if it was different (zoom, autofocus).
         dt: time between the frames, a number or `[*B]`; 1 gives px/step, seconds give px/s.
 
@@ -100,10 +100,10 @@ def rigid_flow(
     """Returns the flow of a world of rigid bodies: the simulator's exact raw flow.
 
     Convention: as in `ego_flow`, with one motion for each instance. Row i of
-    `prev_from_curr_by_instance` takes a point fixed to instance i from the current camera's frame
-    into the previous camera's, at the previous frame; row 0 is the static world's. Where a pixel's
-    row equals `prev_from_curr`, the result is bitwise equal to that of `ego_flow`. An unknown row
-    (nan) makes only the pixels of its instance invalid.
+    `prev_from_curr_by_instance` transforms a point fixed to instance i from the current camera's
+    coordinates to the previous camera's, at the previous frame; row 0 is the static world's. Where
+    a pixel's row equals `prev_from_curr`, the result is bitwise equal to that of `ego_flow`. An
+    unknown row (nan) makes only the pixels of its instance invalid.
 
     Equation 1 of the paper.
 

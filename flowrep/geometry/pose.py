@@ -58,8 +58,8 @@ def relative_motion(
 ) -> Tensor:
     """Returns `prev_from_curr` `[*B, 4, 4]`, composed in float64 and returned as `dtype`.
 
-    Convention: it takes a point from the current camera's frame into the previous camera's (R and T
-    of equation 11 of the paper). A world kilometres wide costs no precision, since large
+    Convention: it transforms a point from the current camera's coordinates to the previous camera's
+    (R and T of equation 11 of the paper). A world kilometres wide costs no precision, since large
     coordinates cancel before the result is rounded. Equal poses give exactly the identity.
 
     Args:
@@ -100,10 +100,10 @@ def instance_motion(
 ) -> Tensor:
     """Returns the motion of each body relative to the camera, `[*B, 1 + N, 4, 4]`.
 
-    Convention: row 0 is the static world's, `prev_from_curr`; row 1 + i takes a point fixed to body
-    i from the current camera's frame into the previous camera's, at the previous frame. If a body's
-    pose has not changed, its row is bitwise equal to row 0. Motions are composed in float64. A
-    body's axes and origin don't matter, as long as they are fixed to it.
+    Convention: row 0 is the static world's, `prev_from_curr`; row 1 + i transforms a point fixed to
+    body i from the current camera's coordinates to the previous camera's, at the previous frame. If
+    a body's pose has not changed, its row is bitwise equal to row 0. Motions are composed in
+    float64. A body's axes and origin don't matter, as long as they are fixed to it.
 
     Args:
         world_from_prev: see `relative_motion`, as for `world_from_curr` and `dtype`.
@@ -205,11 +205,11 @@ def check_rigid(name: str, a_from_b: Tensor, *, tolerance: float = 1e-3) -> None
 
 
 def transform_points(a_from_b: Tensor, points_b: Tensor) -> Tensor:
-    """Returns points `[*B, ..., 3]` in frame a, in the wider of the arguments' two float types.
+    """Returns points `[*B, ..., 3]` in coordinates a, in the wider of the two float types.
 
     Args:
         a_from_b: `[*B, 4, 4]`; its batch dims are the leading dims of `points_b`.
-        points_b: `[*B, ..., 3]`, metres, in frame b.
+        points_b: `[*B, ..., 3]`, metres, in coordinates b.
 
     >>> a_from_b = torch.eye(4)
     >>> a_from_b[:3, 3] = torch.tensor([1.0, 2.0, 3.0])

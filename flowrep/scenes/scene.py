@@ -60,7 +60,7 @@ def _named_once(parts: Sequence[Any]) -> Sequence[Any]:
     names = [getattr(part, "name", part) for part in parts]
     for name in names:
         if names.count(name) > 1:
-            raise ValueError(f"two are named {name!r}; rename one of them")
+            raise ValueError(f"two entries are named {name!r}; rename one of them")
     return parts
 
 

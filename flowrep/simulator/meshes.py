@@ -24,7 +24,7 @@ _CHUNK_TRIANGLES = 24
 class Body:
     """A rigid body, with its ids in the maps."""
 
-    vertices: NDArray[np.float64]  # [V, 3], metres, in its own frame, or the world's if static
+    vertices: NDArray[np.float64]  # [V, 3], metres, in body coordinates; world if static
     triangles: NDArray[np.int64]  # [T, 3], vertices, counter-clockwise seen from outside
     semantic: int
     instance: int  # 0 for the static world
@@ -34,7 +34,7 @@ class Body:
 class Triangles(NamedTuple):
     """All bodies, in C chunks, as arrays for the rasteriser."""
 
-    points: NDArray[np.float64]  # [V, 3], in the frames of their bodies
+    points: NDArray[np.float64]  # [V, 3], in the coordinates of their bodies
     corners: NDArray[np.int32]  # [T, 3], indices among the points of the triangle's chunk
     point_bounds: NDArray[np.int32]  # [C + 1], chunk c has points bounds[c] to bounds[c + 1] - 1
     corner_bounds: NDArray[np.int32]  # [C + 1], the same for triangles

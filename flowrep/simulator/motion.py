@@ -52,8 +52,8 @@ def instance_motion(
 ) -> Array:
     """Returns prev_from_curr by instance [..., 1 + M, 4, 4]; row 0 is the static world's.
 
-    Row 1 + i takes a point fixed to body i from the current camera's frame into the previous
-    camera's, at the previous step.
+    Row 1 + i transforms a point fixed to body i from the current camera's coordinates to the
+    previous camera's, at the previous step.
     """
     static = relative_motion(world_from_prev, world_from_curr)[..., None, :, :]
     # A point of a body has the same body coordinates at both steps. Transform it from the current

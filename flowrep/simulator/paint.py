@@ -125,7 +125,7 @@ def _paint_front(image: NDArray[np.uint8], floors: int, rgb: tuple[int, int, int
 
 
 class Painted(NamedTuple):
-    """The appearance of T triangles, in the frames of their bodies."""
+    """The appearance of T triangles, in the coordinates of their bodies."""
 
     normals: NDArray[np.float32]  # [T, 3]
     colours: NDArray[np.float32]  # [T, 3], 0 to 255
