@@ -141,7 +141,7 @@ class WorkerVectorEnv(VectorEnv):
     def step_async(self, actions: NDArray[Any]) -> None:
         """Begins a step; `step` with the same actions waits for it and returns its outcome."""
         if self._begun is not None:
-            raise RuntimeError("a step has begun: call step() for its outcome first")
+            raise RuntimeError("a step is under way: call step() for its outcome first")
         actions = np.array(actions)
         self._send("step", lambda rows: {"actions": actions[rows]})
         self._begun = actions
