@@ -33,7 +33,7 @@ _SIDE_BY_SIDE = partial(SyncVectorEnv, copy=False, autoreset_mode=AutoresetMode.
 
 PATIENCE_S, PATIENCE_AFTER_STOP_S = 300.0, 10.0
 """How long a worker may take to answer. It starts in seconds and steps in milliseconds, but the
-machine may be busy. After a signal to stop the limit is shorter: SIGKILL may follow soon."""
+machine may be busy. After a signal to stop there is less time: SIGKILL may follow soon."""
 
 
 class WorkerError(RuntimeError):

@@ -61,7 +61,7 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
         paths = [config.parent for config in sorted(folder.rglob("config.yaml"))]
         paths = [p for p in paths if {".hydra", "wandb"}.isdisjoint(p.relative_to(folder).parts)]
         if not paths:
-            what = "contains no run" if folder.exists() else "does not exist"
+            what = "holds no run" if folder.exists() else "does not exist"
             raise RunFolderError(f"'{folder}' {what}. Give the folder of a run or of a sweep")
         for path in paths:
             try:
