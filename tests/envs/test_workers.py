@@ -210,6 +210,7 @@ def test_a_suspended_worker_is_named_and_neither_waited_for_nor_left_behind(
     process = env._workers[1].process
     os.kill(process.pid, signal.SIGSTOP)
     monkeypatch.setattr(workers, short, 0.5)
+    monkeypatch.setattr(workers, "PATIENCE_AT_THE_END_S", 0.5)
     with StopRequest():
         if is_asked_to_stop:
             os.kill(os.getpid(), signal.SIGTERM)

@@ -9,7 +9,7 @@ pytest.importorskip("pybullet", reason="the streets are simulated in PyBullet")
 
 from examples.torchrl_trainer import train
 
-SMALL = {"num_envs": 2, "side": 36, "batch_size": 8}
+SMALL = {"num_envs": 2, "side": 36, "batch_size": 8, "capacity": 200}
 
 
 def differing(a, b, place=""):
