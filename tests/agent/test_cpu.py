@@ -1,11 +1,10 @@
 import platform
-import subprocess
-import sys
 
 import pytest
 import torch
 
 from flowrep.agent import cpu, torch_threads
+from tests.running import run_python
 
 COUNT_PAGE_FAULTS = """
 import resource, runpy, sys, types
@@ -26,8 +25,7 @@ print(by_default, faults())
 @pytest.mark.slow
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc's allocator")
 def test_a_freed_block_is_reused_without_page_faults():
-    command = [sys.executable, "-c", COUNT_PAGE_FAULTS, cpu.__file__]
-    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    result = run_python("-c", COUNT_PAGE_FAULTS, cpu.__file__, check=True)
     by_default, kept = map(int, result.stdout.split())
     assert kept < 0.1 * by_default
 

@@ -1,8 +1,5 @@
 """Representations without TorchRL: numpy maps that other learners take as they are."""
 
-import subprocess
-import sys
-
 import gymnasium
 import numpy as np
 import pytest
@@ -12,6 +9,7 @@ from gymnasium.utils.env_checker import check_env
 
 from flowrep.envs import Outcome, RepresentationObservation, make_env
 from flowrep.transforms import REPRESENTATIONS, Depth
+from tests.running import run_python
 
 ID = "flowrep/StraightRoad-v0"
 ALL = [name for name in REPRESENTATIONS if name != "rgb"]
@@ -29,7 +27,7 @@ def test_gymnasiums_own_checks_pass(joined):
 def test_gymnasium_finds_a_street_by_its_module_where_nobody_has_imported_flowrep():
     made = f"gymnasium.make('flowrep.envs:{ID}').unwrapped.scene.name"
     code = f"import gymnasium, sys; assert 'flowrep' not in sys.modules; print({made})"
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    found = run_python("-c", code, check=True)
     assert found.stdout.strip() == "straight_road"
 
 

@@ -13,8 +13,9 @@ pytest.importorskip("pybullet", reason="training drives the simulated street")
 
 from flowrep.agent import load_checkpoint
 from flowrep.experiment.run import RunFolder
+from tests.comparing import differing
 from tests.config.composing import plain
-from tests.experiment.test_runner import differing, without_clock
+from tests.experiment.test_runner import without_clock
 
 pytestmark = pytest.mark.slow
 

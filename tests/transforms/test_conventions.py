@@ -9,10 +9,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +23,7 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv, check_env_specs
 from flowrep import diagnose
 from flowrep.geometry import intrinsics_from_fov
 from flowrep.transforms import CONVENTIONS, FlowFactorize, RawFlow, sensors_from
+from tests.running import ENVIRONMENT, run_python
 
 STEPS, HEIGHT, WIDTH = 4, 5, 7
 K = np.array([[6.0, 0.0, 3.2], [0.0, 5.0, 2.1], [0.0, 0.0, 1.0]])
@@ -647,9 +645,8 @@ def test_genesis_itself(tmp_path):
     if importlib.util.find_spec("genesis") is None:
         pytest.skip("pip install genesis-world; it runs on a CPU, with EGL")
     # in a process of its own: a graphics driver that fails may take its process with it
-    environment = os.environ | {"PYOPENGL_PLATFORM": "egl"}
-    command = [sys.executable, "-c", GENESIS, str(tmp_path / "frames.pt")]
-    result = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500)
+    environment = ENVIRONMENT | {"PYOPENGL_PLATFORM": "egl"}
+    result = run_python("-c", GENESIS, tmp_path / "frames.pt", env=environment, timeout=500)
     if result.returncode != 0:
         pytest.skip(f"Genesis can't draw here: {result.stderr.strip().splitlines()[-1:]}")
     seen = torch.load(tmp_path / "frames.pt", weights_only=False)
