@@ -236,6 +236,7 @@ def test_getting_started_works_as_it_is_pasted(tmp_path):
         words = [word.replace("episodes=100", "episodes=1") for word in words]
         if "flowrep.train" in words:
             words += ["debug=smoke", "evaluation.baselines=[]", "evaluation.speeds=[normal]"]
+            words += ["scene.time_limit_steps=40", "evaluation.every_frames=0"]
         ran = run_python(*words[1:], cwd=tmp_path)
         assert ran.returncode == 0, (words, ran.stderr)
     made = ("outputs/first/report/index.html", "out/strip.mp4", "out/flow/obj")
