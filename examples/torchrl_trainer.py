@@ -52,7 +52,9 @@ class StreetCollector(Collector):
         torch.set_rng_state(state_dict["rng"])
 
 
-def make_trainer(frames: int, num_envs: int, side: int, batch_size: int, seed: int) -> Trainer:
+def make_trainer(
+    frames: int, num_envs: int, side: int, batch_size: int, capacity: int, seed: int
+) -> Trainer:
     """Returns a trainer of discrete SAC with about one update for each 10 frames."""
     torch.manual_seed(seed)
     scene = load_scene("straight_road")
@@ -64,7 +66,7 @@ def make_trainer(frames: int, num_envs: int, side: int, batch_size: int, seed: i
     network = policy[0].module.network
     loss = DiscreteSACMapLoss(network, DiscreteActions.from_spec(action_spec), options)
     memory = ReplayMemory(
-        network.codecs, capacity=50_000, batch_size=batch_size, device="cpu", n_steps=N_STEPS,
+        network.codecs, capacity=capacity, batch_size=batch_size, device="cpu", n_steps=N_STEPS,
         gamma=GAMMA,
     )  # fmt: skip
     steps = 10  # frames of each env between two rounds of updates
@@ -86,10 +88,10 @@ def make_trainer(frames: int, num_envs: int, side: int, batch_size: int, seed: i
 
 def train(
     file: Path, frames: int, num_envs: int = 32, side: int = 48, batch_size: int = 256,
-    seed: int = 0,
+    capacity: int = 50_000, seed: int = 0,
 ) -> Trainer:  # fmt: skip
     """Trains until `frames`, resuming from `file` if it exists, and writes `file`."""
-    trainer = make_trainer(frames, num_envs, side, batch_size, seed)
+    trainer = make_trainer(frames, num_envs, side, batch_size, capacity, seed)
     if file.exists():
         trainer.load_state_dict(torch.load(file, weights_only=True))
 

@@ -1,7 +1,6 @@
 """Imports point one way: commands → config → experiment → envs → simulator → scenes, and so on."""
 
 import ast
-import subprocess
 import sys
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -9,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import flowrep
+from tests.running import run_python
 
 PACKAGE = Path(flowrep.__file__).parent
 
@@ -134,6 +134,6 @@ def test_the_transforms_bring_torch_tensordict_and_torchrl_alone():
         "print(sorted((added & unwanted) | ({'pybullet', 'hydra', 'matplotlib', 'cv2', 'shapely'}"
         " & set(sys.modules))))"
     )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    result = run_python("-c", code)
     assert result.returncode == 0, result.stderr
     assert result.stdout.strip() == "[]"

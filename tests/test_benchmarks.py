@@ -1,17 +1,11 @@
 """The benchmarks measure what they say, and run to their end."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from flowrep.envs.sensing import Sensing
 from flowrep.simulator.camera import depth_from_zbuffer
-
-ROOT = Path(__file__).parents[1]
+from tests.running import ROOT, run_python
 
 
 def test_pybullets_picture_is_timed_with_everyone_in_place(monkeypatch):
@@ -49,9 +43,7 @@ def test_pybullets_picture_is_timed_with_everyone_in_place(monkeypatch):
 )  # fmt: skip
 def test_a_benchmark_prints_its_tables(arguments, rows):
     script, *options = arguments.split()
-    command = [sys.executable, str(ROOT / "benchmarks" / script), *options]
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    result = subprocess.run(command, capture_output=True, text=True, env=environment)
+    result = run_python(ROOT / "benchmarks" / script, *options)
     assert result.returncode == 0, result.stderr
     tables = [line for line in result.stdout.splitlines() if line.startswith("| ")]
     heads = sum(set(line) <= set("| -") for line in tables)

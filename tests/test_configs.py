@@ -32,12 +32,6 @@ def test_every_choice_builds_an_env_and_an_agent_that_act(group, name):
     assert action.shape == env.batch_size
 
 
-@pytest.mark.slow_after_first
-@pytest.mark.parametrize("name", group_choices("representations"))
-def test_a_representation_is_one_key_named_as_its_file(name):
-    assert list(plain("train", f"representations=[{name}]")["representations"]) == [name]
-
-
 @pytest.mark.parametrize("name", group_choices("algorithm"))
 def test_an_algorithm_spells_out_every_option_of_its_class_with_its_default(name):
     config = composed(f"algorithm={name}").algorithm

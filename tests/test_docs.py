@@ -1,12 +1,9 @@
 """The documentation: every transform has a page, what pages show runs, links lead somewhere."""
 
 import inspect
-import os
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -31,6 +28,7 @@ from flowrep.config.schema import (
 from flowrep.transforms import RawFlow
 from flowrep.transforms.hydra_configs import CONFIGS
 from tests.config.composing import plain
+from tests.running import run_python
 from tests.transforms.fake_env import HEIGHT, WIDTH, FakeSensorEnv
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -228,7 +226,6 @@ def test_getting_started_works_as_it_is_pasted(tmp_path):
     exec(python_of(page), namespace)
     assert namespace["rollout"]["obj"].shape == (1, 20, 2, 84, 84)
     (tmp_path / "examples").symlink_to(root / "examples")
-    env = os.environ | {"PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
     targets = re.findall(r"^([\w-]+):", (root / "Makefile").read_text("utf-8"), re.MULTILINE)
     for words in commands_in(page):
         if words[0] == "make":
@@ -239,9 +236,8 @@ def test_getting_started_works_as_it_is_pasted(tmp_path):
         words = [word.replace("episodes=100", "episodes=1") for word in words]
         if "flowrep.train" in words:
             words += ["debug=smoke", "evaluation.baselines=[]", "evaluation.speeds=[normal]"]
-        ran = subprocess.run(
-            [sys.executable, *words[1:]], cwd=tmp_path, env=env, capture_output=True, text=True
-        )
+            words += ["scene.time_limit_steps=40", "evaluation.every_frames=0"]
+        ran = run_python(*words[1:], cwd=tmp_path)
         assert ran.returncode == 0, (words, ran.stderr)
     made = ("outputs/first/report/index.html", "out/strip.mp4", "out/flow/obj")
     assert all((tmp_path / name).exists() for name in made)
@@ -265,8 +261,7 @@ def test_the_site_has_constructors_with_all_of_their_options_and_links_between_n
     shutil.copy(DOCS.parent / "mkdocs.yml", tmp_path)
     for name in ("flowrep", "conf", "CONVENTIONS.md"):
         (tmp_path / name).symlink_to(DOCS.parent / name)
-    build = [sys.executable, "-m", "zensical", "build", "--strict"]
-    built = subprocess.run(build, cwd=tmp_path, capture_output=True, text=True)
+    built = run_python("-m", "zensical", "build", "--strict", cwd=tmp_path)
     assert built.returncode == 0, built.stdout
     page = (tmp_path / "site" / "reference" / "transforms" / "index.html").read_text("utf-8")
     text = re.sub("<[^>]+>", "", page)

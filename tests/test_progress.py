@@ -11,6 +11,7 @@ import termios
 import pytest
 
 from flowrep.progress import Every, StopRequest, progress_bar
+from tests.running import run_python
 
 
 @pytest.mark.parametrize(
@@ -96,7 +97,7 @@ for _ in progress.progress_bar(iter(range(3)), what="quick", unit="frame"):
 
 
 def test_in_a_log_progress_is_now_and_then_a_line_of_what_how_far_how_fast_how_long():
-    ran = subprocess.run([sys.executable, "-c", NESTED], capture_output=True, text=True, check=True)
+    ran = run_python("-c", NESTED, check=True)
     assert ran.stdout == ""
     assert ran.stderr.replace("\n", "").isprintable()  # no return and no move of a cursor
     training = [line for line in ran.stderr.splitlines() if line.startswith("training: ")]
@@ -123,8 +124,7 @@ print(open(f"/proc/self/task/{os.getpid()}/children").read())
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/task"), reason="looks into /proc")
 def test_a_bar_starts_no_process_that_a_hang_up_would_end():
-    command = [sys.executable, "-c", CHILDREN]
-    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "\n"
+    assert run_python("-c", CHILDREN, check=True).stdout == "\n"
 
 
 def test_a_line_comes_every_half_minute(monkeypatch, capsys):

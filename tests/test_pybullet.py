@@ -7,9 +7,6 @@ What is expected is computed here from `getCameraImage`'s buffers, the projectio
 import importlib.util
 import math
 import os
-import subprocess
-import sys
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -24,6 +21,7 @@ from torchrl.envs import Compose, GymWrapper, TransformedEnv, check_env_specs
 from flowrep.geometry import rigid_flow
 from flowrep.pybullet import BulletCamera, BulletFlow
 from flowrep.transforms import FlowFactorize, RawFlow
+from tests.running import run_python
 
 HEIGHT, WIDTH = 90, 132
 VIEW = pybullet.computeViewMatrix([1.1, -0.9, 0.8], [0.1, 0, 0.3], [0, 0, 1])
@@ -689,11 +687,7 @@ print(near.sum(), *(
 def test_egls_plugin_samples_at_the_centres_of_pixels_and_is_noticed():
     if importlib.util.find_spec("eglRenderer") is None:
         pytest.skip("this PyBullet has no EGL plugin")
-    root = str(Path(__file__).parents[1])
-    result = subprocess.run(
-        [sys.executable, "-c", EGL], capture_output=True, text=True, timeout=120,
-        env=os.environ | {"PYTHONPATH": root},
-    )  # fmt: skip
+    result = run_python("-c", EGL, timeout=120)
     if result.returncode != 0:
         pytest.skip("EGL can't draw here: apt-get install libegl1 libgl1-mesa-dri")
     lines = [line for line in result.stdout.splitlines() if line[:1].isdigit()]

@@ -28,6 +28,7 @@ from flowrep.view import (
     drive_on,
     episodes_of,
     folder_of,
+    main,
     moments,
     moving_pixels,
 )
@@ -133,13 +134,14 @@ def test_a_full_disk_leaves_the_earlier_view_whole(tmp_path):
     assert (tmp_path / "sheet.png").read_text() == "old"
 
 
-@pytest.mark.slow
-def test_a_refused_view_leaves_no_folder(tmp_path, monkeypatch):
+def test_a_refused_view_leaves_no_folder(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for wrong in ("policy=pilot", "path=up", "speed=fast"):
-        done = view(wrong)
-        assert done.returncode == 2
-        assert wrong.partition("=")[0] in done.stderr
+        monkeypatch.setattr(sys, "argv", ["view", wrong])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        assert ended.value.code == 2
+        assert wrong.partition("=")[0] in capsys.readouterr().err
         assert not [*tmp_path.iterdir()]
 
 

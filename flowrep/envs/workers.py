@@ -34,6 +34,8 @@ _SIDE_BY_SIDE = partial(SyncVectorEnv, copy=False, autoreset_mode=AutoresetMode.
 PATIENCE_S, PATIENCE_AFTER_STOP_S = 300.0, 10.0
 """How long a worker may take to answer. It starts in seconds and steps in milliseconds, but the
 machine may be busy. After a signal to stop there is less time: SIGKILL may follow soon."""
+PATIENCE_AT_THE_END_S = 5.0
+"""How long workers may take to end before they are killed."""
 
 
 class WorkerError(RuntimeError):
@@ -236,7 +238,7 @@ def _end(workers: list[_Worker]) -> None:
     """Closes the pipes, which ends the workers, and waits for them."""
     for worker in workers:
         worker.pipe.close()
-    deadline = time.monotonic() + 5.0
+    deadline = time.monotonic() + PATIENCE_AT_THE_END_S
     for worker in workers:
         worker.process.join(timeout=max(0.0, deadline - time.monotonic()))
         if worker.process.is_alive():

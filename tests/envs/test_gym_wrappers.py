@@ -1,8 +1,5 @@
 """Representations without TorchRL: numpy maps that other learners take as they are."""
 
-import subprocess
-import sys
-
 import gymnasium
 import numpy as np
 import pytest
@@ -25,12 +22,8 @@ def test_gymnasiums_own_checks_pass(joined):
     assert env.unwrapped.K.shape == (3, 3)
 
 
-@pytest.mark.slow
-def test_gymnasium_finds_a_street_by_its_module_where_nobody_has_imported_flowrep():
-    made = f"gymnasium.make('flowrep.envs:{ID}').unwrapped.scene.name"
-    code = f"import gymnasium, sys; assert 'flowrep' not in sys.modules; print({made})"
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert found.stdout.strip() == "straight_road"
+def test_gymnasium_finds_a_street_by_its_module():
+    assert gymnasium.make(f"flowrep.envs:{ID}").unwrapped.scene.name == "straight_road"
 
 
 def test_a_window_that_can_not_open_is_refused_at_once():

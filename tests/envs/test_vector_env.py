@@ -10,22 +10,13 @@ from flowrep.envs import Outcome, StreetEnv
 from flowrep.envs.episode import hit_name
 from flowrep.envs.sensing import SENSORS
 from flowrep.envs.vector_env import StreetVectorEnv
+from tests.comparing import differing
 
 NUM_ENVS = 3
 
 
 def make(**arguments):
     return StreetVectorEnv([partial(StreetEnv, "h_shaped_pathways", **arguments)] * NUM_ENVS)
-
-
-def assert_same(a, b):
-    assert a.keys() == b.keys()
-    for key, value in a.items():
-        if isinstance(value, dict):
-            assert_same(value, b[key])
-        else:
-            assert value.dtype == b[key].dtype, key
-            np.testing.assert_array_equal(value, b[key], err_msg=key)
 
 
 @pytest.mark.slow_after_first
@@ -42,7 +33,10 @@ def test_steps_and_partial_resets_are_those_of_streets_alone(make_street, argume
     def assert_seen(observation, alone):
         assert observation in vector.observation_space
         for i, (seen, info) in enumerate(alone):
-            assert_same({key: value[i] for key, value in observation["sensor"].items()}, seen)
+            assert (
+                differing({key: value[i] for key, value in observation["sensor"].items()}, seen)
+                == []
+            )
             status = {key: observation[key][i].tolist() for key in ("outcome", "hit", "path")}
             assert Outcome(status["outcome"][0]).label == info["outcome"]
             assert hit_name(status["hit"][0]) == info["hit"]
@@ -95,7 +89,7 @@ def test_a_reset_of_some_or_none_returns_what_was_last_seen_as_the_callers_own(m
         for name in seen.keys() - {"sensor"}:
             np.testing.assert_array_equal(seen[name][others], before[name][others])
     again["sensor"]["depth"][:] = 0.0
-    assert_same(last, kept)
+    assert differing(last, kept) == []
     assert ours.step(np.zeros(NUM_ENVS, dtype=int))[0]["sensor"]["depth"].any()
 
 

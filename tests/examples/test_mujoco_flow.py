@@ -6,8 +6,6 @@ MuJoCo draws in a process of its own: a graphics driver that fails may take its 
 import importlib.util
 import os
 import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -15,6 +13,7 @@ from tensordict import TensorDict
 
 from flowrep import diagnose
 from flowrep.geometry import transform_points, unproject
+from tests.running import ENVIRONMENT, ROOT, run_python
 
 pytest.importorskip("gymnasium", reason="the example wraps a gymnasium env")
 if importlib.util.find_spec("mujoco") is None:
@@ -22,7 +21,6 @@ if importlib.util.find_spec("mujoco") is None:
         "MuJoCo is not installed: pip install 'flowrep-rl[examples]'", allow_module_level=True
     )
 
-ROOT = Path(__file__).parents[2]
 TIMEOUT_S = 120
 PROBE = """
 import mujoco
@@ -67,17 +65,13 @@ torch.save(record, sys.argv[1])
 """
 
 
-def run_python(*arguments: str, backend: str) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | {"MUJOCO_GL": backend, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, *arguments]
-    return subprocess.run(
-        command, env=environment, capture_output=True, text=True, timeout=TIMEOUT_S
-    )
+def draw(*arguments, backend):
+    return run_python(*arguments, env=ENVIRONMENT | {"MUJOCO_GL": backend}, timeout=TIMEOUT_S)
 
 
 def can_draw(backend: str) -> bool:
     try:
-        return run_python("-c", PROBE, backend=backend).returncode == 0
+        return draw("-c", PROBE, backend=backend).returncode == 0
     except subprocess.TimeoutExpired:
         return False
 
@@ -94,7 +88,7 @@ def backend():
 @pytest.fixture(scope="module")
 def record(backend, tmp_path_factory):
     path = tmp_path_factory.mktemp("yard") / "record.pt"
-    result = run_python("-c", RECORD, str(path), backend=backend)
+    result = draw("-c", RECORD, path, backend=backend)
     assert result.returncode == 0, result.stderr
     return torch.load(path, weights_only=True)
 
@@ -128,8 +122,8 @@ def test_each_frame_warps_into_the_one_before_and_only_what_moves_lights_up(reco
 
 def test_the_example_runs_and_writes_its_strip(backend, tmp_path):
     path = tmp_path / "strip.png"
-    script = str(ROOT / "examples" / "mujoco_flow.py")
-    result = run_python(script, str(path), backend=backend)
+    script = ROOT / "examples" / "mujoco_flow.py"
+    result = draw(script, path, backend=backend)
     assert result.returncode == 0, result.stderr
     assert "max |obj| of what stands   0.0e+00 px" in result.stdout
     assert path.read_bytes().startswith(b"\x89PNG")

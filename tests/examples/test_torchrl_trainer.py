@@ -8,20 +8,9 @@ import torch
 pytest.importorskip("pybullet", reason="the streets are simulated in PyBullet")
 
 from examples.torchrl_trainer import train
+from tests.comparing import differing
 
-SMALL = {"num_envs": 2, "side": 36, "batch_size": 8}
-
-
-def differing(a, b, place=""):
-    """Names every leaf in which two nested states differ."""
-    if isinstance(a, dict):
-        assert a.keys() == b.keys(), place
-        return [d for key in a for d in differing(a[key], b[key], f"{place}/{key}")]
-    if isinstance(a, list | tuple):
-        pairs = enumerate(zip(a, b, strict=True))
-        return [d for i, pair in pairs for d in differing(*pair, f"{place}/{i}")]
-    same = torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
-    return [] if same else [place]
+SMALL = {"num_envs": 2, "side": 36, "batch_size": 8, "capacity": 200}
 
 
 @pytest.mark.slow

@@ -13,8 +13,8 @@ from flowrep.agent import CheckpointError, save_checkpoint
 from flowrep.config import UsageError, group_choices
 from flowrep.experiment.agents import PRETRAINED, Agent, packed, unpacked
 from flowrep.experiment.run import RunFolder
+from tests.comparing import differing
 from tests.config.composing import composed
-from tests.experiment.test_runner import differing
 
 SCENES = sorted(group_choices("scene"))
 # of 20 episodes; one that never turns drives Straight Road in one of ten, the other scenes never

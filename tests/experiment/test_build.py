@@ -10,7 +10,7 @@ from flowrep.agent import DoubleDQN, observation
 from flowrep.config import UsageError
 from flowrep.config.schema import ForeignAlgorithm
 from flowrep.experiment import build
-from flowrep.experiment.build import algorithm, device, evaluation_workers, with_precision
+from flowrep.experiment.build import algorithm, evaluation_workers, with_precision
 from flowrep.options import ALGORITHMS
 from tests.config.composing import composed
 
@@ -84,12 +84,6 @@ def test_a_new_run_s_config_says_in_which_format_it_computes(monkeypatch, faster
 def test_what_is_no_algorithm_is_refused(target, options, says):
     with pytest.raises(UsageError, match=says):
         algorithm(named(target, **options))
-
-
-def test_a_device_that_is_not_there_is_named():
-    assert device("cpu").type == "cpu"
-    with pytest.raises(ValueError, match="device=cuda:99"):
-        device("cuda:99")
 
 
 @pytest.mark.parametrize(

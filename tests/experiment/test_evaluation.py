@@ -107,7 +107,7 @@ def test_an_episode_does_not_depend_on_what_else_is_in_the_batch(scene):
     runs = []
     for num_envs, num_workers in ((1, 0), (3, 0), (5, 2)):
         env = make_env(scene, names, noise=NOISE, num_envs=num_envs, num_workers=num_workers)
-        driven = (evaluate(env, weigher(*names), episodes(6), greedy=greedy) for greedy in ways)
+        driven = (evaluate(env, weigher(*names), episodes(4), greedy=greedy) for greedy in ways)
         runs.append([outcomes(found) for found in driven])
         env.close()
     assert runs[0] == runs[1] == runs[2]

@@ -13,8 +13,9 @@ pytest.importorskip("pybullet", reason="training drives the simulated street")
 
 from flowrep.agent import load_checkpoint
 from flowrep.experiment.run import RunFolder
+from tests.comparing import differing
 from tests.config.composing import plain
-from tests.experiment.test_runner import differing, without_clock
+from tests.experiment.test_runner import without_clock
 
 pytestmark = pytest.mark.slow
 
@@ -92,22 +93,3 @@ def test_a_full_disk_ends_in_one_line_and_leaves_the_last_checkpoint(tmp_path, c
     assert "Traceback" not in reply["printed"]
     assert differing(before, load_checkpoint(run.checkpoint_path)) == []
     assert carry_on(run)["code"] == 0
-
-
-def test_the_command_itself_is_killed_and_resumed(tmp_path):
-    """As a person or a scheduler does it, once the first checkpoint is there."""
-    run = tmp_path / "run"
-    latest = run / "checkpoint" / "latest.safetensors"
-    command = [sys.executable, "-m", "flowrep.train"]
-    start = [*command, *SMALL, "total_frames=96", f"hydra.run.dir={run}"]
-    process = subprocess.Popen(start, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 120
-    while not latest.exists() and process.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.005)
-    process.kill()
-    assert process.wait() == -signal.SIGKILL
-    assert 0 < load_checkpoint(latest)["frames"] < 96
-    result = subprocess.run([*command, f"resume={run}"], capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr
-    assert load_checkpoint(latest)["frames"] == 96
-    assert [int(row["frames"]) for row in RunFolder(run).read_metrics()] == list(range(4, 97, 4))

@@ -3,13 +3,14 @@
 import copy
 import fcntl
 import json
+import multiprocessing
 import os
 import pickle
 import platform
 import shutil
-import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -24,27 +25,25 @@ from flowrep.experiment.run import RunFolder, check_origin, machine_of, origin_o
 from flowrep.tables import TableError, write_rows
 from tests.config.composing import plain
 
-HOLD = """
-import sys, time
-from flowrep.experiment.run import RunFolder
-with RunFolder(sys.argv[1]).held("training"):
-    print("held", flush=True)
-    time.sleep(100)
-"""
+
+def hold(run, is_held):
+    with run.held("training"):
+        is_held.set()
+        time.sleep(100)
 
 
-@pytest.mark.slow
 def test_who_holds_a_folder_is_named_and_one_that_was_killed_holds_it_no_more(tmp_path):
     run = RunFolder(tmp_path)
-    with subprocess.Popen([sys.executable, "-c", HOLD, tmp_path], stdout=subprocess.PIPE) as other:
-        try:
-            assert other.stdout.readline() == b"held\n"
-            holder = rf"process {other.pid} on {platform.node()} .*training.* \d{{4}}-\d\d-\d\d "
-            with pytest.raises(FolderInUseError, match=holder), run.held("evaluating"):
-                pass
-        finally:
-            other.kill()
-    assert other.returncode == -signal.SIGKILL
+    fork = multiprocessing.get_context("fork")
+    is_held = fork.Event()
+    other = fork.Process(target=hold, args=(run, is_held), daemon=True)
+    other.start()
+    assert is_held.wait(timeout=60)
+    holder = rf"process {other.pid} on {platform.node()} .*training.* \d{{4}}-\d\d-\d\d "
+    with pytest.raises(FolderInUseError, match=holder), run.held("evaluating"):
+        pass
+    other.kill()
+    other.join()
     with run.held("evaluating"):
         assert json.loads((tmp_path / ".lock").read_text())["pid"] == os.getpid()
 

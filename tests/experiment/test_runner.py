@@ -18,6 +18,7 @@ from flowrep.experiment.run import RunFolder
 from flowrep.experiment.runner import Means, RecentEpisodes, Runner, progress_text
 from flowrep.progress import StopRequest
 from flowrep.train import resumed
+from tests.comparing import differing
 from tests.config.composing import composed, plain
 
 RUNNING, SUCCESS, COLLISION = 0, 1, 2
@@ -194,19 +195,6 @@ def finish(folder, *stops: int, **how) -> Runner:
         runner = new_run(folder, resume=(folder / "checkpoint").exists(), **how)
         trained(runner, StopAfter(runner, stop))
     return trained(new_run(folder, resume=bool(stops), **how))
-
-
-def differing(a, b, place="") -> list[str]:
-    """Names every leaf in which two nested states differ."""
-    if isinstance(a, TensorDict):
-        a, b = a.to_dict(), b.to_dict()
-    if isinstance(a, list):
-        a, b = dict(enumerate(a)), dict(enumerate(b))
-    if isinstance(a, dict):
-        keys = a.keys() | b.keys()
-        return [d for key in keys for d in differing(a[key], b[key], f"{place}/{key}")]
-    same = torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
-    return [] if same else [place]
 
 
 @pytest.mark.slow

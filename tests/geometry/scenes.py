@@ -1,11 +1,10 @@
 """Inputs for the geometry's tests: asymmetric, so that a swap of anything shows."""
 
 import math
+from itertools import product
 
 import torch
 from torch import Tensor
-
-from flowrep.geometry import project, transform_points, unproject
 
 HEIGHT, WIDTH = 5, 7
 K = torch.tensor([[11.0, 0.7, 2.6], [0.0, 6.0, 3.1], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -51,13 +50,17 @@ def raw_flow(*batch: int) -> Tensor:
     return 5 * torch.randn((*batch, 2, HEIGHT, WIDTH), generator=generator, dtype=torch.float64)
 
 
-def flow_by_points(depth: Tensor, K: Tensor, prev_from_curr: Tensor) -> Tensor:
-    """Returns ego flow by way of a point cloud: unproject, move, project, subtract (unbatched)."""
-    points = transform_points(prev_from_curr, unproject(depth, K))
-    height, width = depth.shape[-2:]
-    v, u = torch.meshgrid(
-        torch.arange(height, dtype=K.dtype) + 0.5,
-        torch.arange(width, dtype=K.dtype) + 0.5,
-        indexing="ij",
-    )
-    return (torch.stack([u, v], -1) - project(points, K)).permute(2, 0, 1)
+def flow_pixel_by_pixel(depth, K, motion, prev_K=None) -> Tensor:
+    """Returns flow `[2, H, W]`, unbatched, in plain floats: unproject, move, project to before."""
+    (fx, skew, cx), (_, fy, cy), _ = K.tolist()
+    (fx_p, skew_p, cx_p), (_, fy_p, cy_p), _ = (K if prev_K is None else prev_K).tolist()
+    out = torch.zeros(2, *depth.shape[-2:], dtype=torch.float64)
+    for row, column in product(*map(range, depth.shape[-2:])):
+        z = depth[0, row, column].item()
+        y = z * (row + 0.5 - cy) / fy
+        x = (z * (column + 0.5 - cx) - skew * y) / fx
+        before = [r[0] * x + r[1] * y + r[2] * z + r[3] for r in motion.tolist()]
+        u = (fx_p * before[0] + skew_p * before[1]) / before[2] + cx_p
+        v = fy_p * before[1] / before[2] + cy_p
+        out[0, row, column], out[1, row, column] = column + 0.5 - u, row + 0.5 - v
+    return out

@@ -17,7 +17,7 @@ from tests.geometry.scenes import (
     WIDTH,
     K,
     depth_map,
-    flow_by_points,
+    flow_pixel_by_pixel,
     raw_flow,
     rigid,
 )
@@ -198,7 +198,7 @@ def street(yaw_deg: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 @pytest.mark.parametrize("yaw_deg", [0.0, 1.0, 3.0, 6.0])
 def test_float32_error_is_an_order_of_magnitude_below_the_homography_s(yaw_deg):
     inputs = street(yaw_deg)
-    exact = flow_by_points(*(tensor.double() for tensor in inputs))
+    exact = flow_pixel_by_pixel(*(tensor.double() for tensor in inputs))
     # px; flow itself reaches 16. By the homography K R K^-1, p - p' is over five times as far off.
     assert (ego_flow(*inputs).flow - exact).abs().max() < 4e-6
 

@@ -83,6 +83,14 @@ def camera_motion(step: int, env: int) -> Tensor:
     return motion
 
 
+def moments(count: int) -> TensorDict:
+    """Returns frames of different envs, episodes and steps, with a raw flow of their own."""
+    frames = [TensorDict({"sensor": frame(i % 3, i % 2, i)}) for i in range(count)]
+    td = TensorDict(torch.stack(frames), [count])
+    td["raw"] = torch.randn(count, 2, HEIGHT, WIDTH, generator=torch.manual_seed(1))
+    return td
+
+
 def moment(depth: Tensor) -> tuple[int, int, int]:
     """Returns (env, episode, step) of a depth map of `frame`."""
     hundredths = round(100 * (depth[0, 0, 0].item() - 2.0))

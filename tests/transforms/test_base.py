@@ -1,4 +1,4 @@
-"""What all transforms share: errors that help, "next", any batch, compilation."""
+"""What all transforms share: errors that help, "next", compilation."""
 
 from __future__ import annotations
 
@@ -16,54 +16,10 @@ from torchrl.envs.transforms import Compose
 
 from flowrep import transforms as T
 from flowrep.transforms.stack import DropKeys
-from tests.transforms.fake_env import (
-    INTRINSICS,
-    NUM_CLASSES,
-    FakeSensorEnv,
-    SelfResettingEnv,
-    frame,
-)
+from tests.transforms.fake_env import INTRINSICS, FakeSensorEnv, SelfResettingEnv, moments
 from tests.transforms.oracles import brightening, same_bits
 
 COMPILE = torch.compile
-TRANSFORMS = {
-    "seg": lambda: T.Segmentation(NUM_CLASSES),
-    "onehot": lambda: T.Segmentation(NUM_CLASSES, encoding="onehot"),
-    "depth": lambda: T.Depth(range_m=14.0),
-    "rgb": T.Rgb,
-    "raw": lambda: T.RawFlow(INTRINSICS, scale=0.5, outputs=["raw", "valid"]),
-    "ego": lambda: T.FlowFactorize(INTRINSICS, outputs=["ego"]),
-    "ego, obj": lambda: T.FlowFactorize(INTRINSICS, scale=10.0),
-    "stack": lambda: T.FrameStack(k=3, in_keys=[("sensor", "rgb")], out_keys=["rgb3"]),
-}
-each_transform = pytest.mark.parametrize("make", TRANSFORMS.values(), ids=list(TRANSFORMS))
-
-
-def moments(*batch: int) -> TensorDict:
-    """Returns frames of different envs and steps, with a raw flow of their own."""
-    count = torch.Size(batch).numel()
-    frames = [frame(i % 3, i % 2, i) for i in range(count)]
-    td = torch.stack([TensorDict({"sensor": one}) for one in frames])
-    td = TensorDict(td, [count])
-    td["raw"] = torch.randn(count, 2, 5, 7, generator=torch.manual_seed(1))
-    return td.reshape(batch) if batch else td[0]
-
-
-def inputs(transform, td: TensorDict) -> list[torch.Tensor]:
-    return [td[key] for key in transform.in_keys]
-
-
-@each_transform
-@pytest.mark.parametrize("batch", [(), (3,), (2, 1)], ids=str)
-def test_any_batch_equals_a_loop_over_frames_and_the_inputs_stay_as_they_are(make, batch):
-    transform, td = make(), moments(*batch)
-    together = transform.compute(*inputs(transform, td))
-    assert all(same_bits(td[key], moments(*batch)[key]) for key in transform.in_keys)
-    alone = [transform.compute(*inputs(transform, one)) for one in td.reshape(-1)]
-    for i, output in enumerate(together):
-        assert output.shape[: len(batch)] == batch
-        want = torch.stack([outputs[i] for outputs in alone])
-        assert torch.equal(output.reshape(want.shape), want)
 
 
 @pytest.mark.slow
@@ -93,26 +49,6 @@ def test_without_a_compiler_compiled_flow_is_refused(monkeypatch):
     monkeypatch.setenv("CXX", "clang++-19")
     with pytest.raises(ValueError, match=r"C\+\+.*clang\+\+-19"):
         T.RawFlow(INTRINSICS, compiled=True)
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-@each_transform
-def test_cuda_equals_cpu(make):
-    transform, td = make(), moments(2, 1)
-    want = transform.compute(*inputs(transform, td))
-    transform, td = transform.to("cuda"), td.to("cuda")
-    got = transform.compute(*inputs(transform, td))
-    for on_cuda, on_cpu in zip(got, want):
-        assert on_cuda.device.type == "cuda"
-        torch.testing.assert_close(on_cuda.cpu(), on_cpu, atol=1e-5, rtol=1e-5)
-
-
-@each_transform
-def test_moves_to_another_device_and_type(make):
-    transform = make().to("meta")
-    td = moments(2).to("meta")
-    outputs = transform.compute(*inputs(transform, td))
-    assert all(output.device.type == "meta" for output in outputs)
 
 
 def test_missing_key_is_named_with_what_the_env_offers_before_the_first_step():

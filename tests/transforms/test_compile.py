@@ -1,4 +1,4 @@
-"""Every transform's computation compiles to one graph for any batch, and never waits for a GPU."""
+"""Every transform computes in one graph for any batch, on any device, and never waits for a GPU."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ import torch
 from torch._dynamo.testing import CompileCounter
 
 from flowrep import transforms as T
-from tests.transforms.fake_env import INTRINSICS, NUM_CLASSES
-from tests.transforms.test_base import inputs, moments
+from tests.transforms.fake_env import INTRINSICS, NUM_CLASSES, moments
 
 POSE = ("sensor", "world_from_cam")
 POSES = "world_from_cam", "world_from_body"
@@ -58,6 +57,10 @@ STEPS = {
 }
 
 
+def inputs(transform, td):
+    return [td[key] for key in transform.in_keys]
+
+
 def of(make):
     return lambda td: ((transform := make()).compute, inputs(transform, td))
 
@@ -89,20 +92,35 @@ def test_one_graph_for_all_batches(case):
     torch._dynamo.reset()
 
 
+def on(device, case):
+    """Returns a case's function and tensors on a device."""
+    function, given = case(framed(3).to(device))
+    if (owner := getattr(function, "__self__", None)) is not None:
+        owner.to(device)
+    return function, given
+
+
+@each_case
+def test_moves_to_another_device(case):
+    function, given = on("meta", case)
+    assert all(output.is_meta for output in function(*given))
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @each_case
-def test_nothing_waits_for_the_gpu(case):
-    td = framed(3).to("cuda")
-    function, given = case(td)
-    if (owner := getattr(function, "__self__", None)) is not None:
-        owner.to("cuda")
-    want = function(*given)  # what is set up once may wait
+def test_a_gpu_gives_what_the_cpu_gives_without_waiting(case):
+    compute, on_cpu = on("cpu", case)
+    want = compute(*on_cpu)
+    function, given = on("cuda", case)
+    function(*given)  # what is set up once may wait
     torch.cuda.set_sync_debug_mode("error")
     try:
         got = function(*given)
     finally:
         torch.cuda.set_sync_debug_mode("default")
-    assert all(a.is_cuda and a.shape == b.shape for a, b in zip(got, want))
+    for on_gpu, expected in zip(got, want):
+        assert on_gpu.is_cuda
+        torch.testing.assert_close(on_gpu.cpu(), expected, atol=1e-5, rtol=1e-5, equal_nan=True)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")

@@ -9,10 +9,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +23,7 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv, check_env_specs
 from flowrep import diagnose
 from flowrep.geometry import intrinsics_from_fov
 from flowrep.transforms import CONVENTIONS, FlowFactorize, RawFlow, sensors_from
+from tests.running import ENVIRONMENT, run_python
 
 STEPS, HEIGHT, WIDTH = 4, 5, 7
 K = np.array([[6.0, 0.0, 3.2], [0.0, 5.0, 2.1], [0.0, 0.0, 1.0]])
@@ -447,7 +445,7 @@ def test_the_page_has_every_row_and_its_python_runs():
     scope["pybullet"].disconnect(scope["client"])
 
 
-# On the simulator itself; MuJoCo's and ManiSkill's rows are tried by tests/examples
+# On the simulator itself; MuJoCo's, mjlab's and ManiSkill's rows are tried by tests/examples
 
 
 @pytest.mark.slow
@@ -490,57 +488,6 @@ def test_newton_itself(depth):
     K = intrinsics_from_fov(math.degrees(fov), axis="vertical", height=size[0], width=size[1])
     more = {"intrinsics": K} if depth == "depth" else {}
     assert_warps("newton", frames, K, depth=depth, body_ids=shapes, static_ids=[0], **more)
-
-
-MUJOCO = """
-<mujoco>
-  <worldbody>
-    <geom type="plane" size="9 9 .1"/>
-    <body mocap="true" pos="0 0 1.2"><camera name="eye" fovy="60" xyaxes="1 0 0 0 .2 1"/></body>
-    <body pos="-.7 4 .5"><freejoint/><geom type="box" size=".5 .4 .3"/></body>
-    <body pos=".8 3 .5"><freejoint/><geom type="sphere" size=".4"/></body>
-  </worldbody>
-</mujoco>
-"""
-
-
-@pytest.mark.slow
-def test_mujoco_warp_itself_which_renders_for_mjlab():
-    mujoco = pytest.importorskip("mujoco", reason="pip install 'flowrep-rl[examples]'")
-    warp = pytest.importorskip("mujoco_warp", reason="pip install mujoco-warp; it runs on a CPU")
-    height, width = 120, 180
-    model = mujoco.MjModel.from_xml_string(MUJOCO)
-    data, geoms = mujoco.MjData(model), [1, 2]
-    frames = []
-    for t in range(5):
-        data.mocap_pos[0] = 0.05 * t, 0.12 * t, 1.2
-        data.mocap_quat[0] = np.roll(
-            Rotation.from_euler("xyz", [0.01 * t, 0, 0.03 * t]).as_quat(), 1
-        )
-        turned = np.roll(Rotation.from_euler("xyz", [0.2 * t, 0.1 * t, 0.2 * t]).as_quat(), 1)
-        data.qpos[:7] = [-0.7 + 0.1 * t, 4, 0.7, *turned]
-        data.qpos[7:] = [0.8, 3 + 0.1 * t, 0.5 + 0.05 * t, 1, 0, 0, 0]
-        mujoco.mj_forward(model, data)
-        on_warp = warp.put_model(model), warp.put_data(model, data)
-        context = warp.create_render_context(
-            model, cam_res=(width, height), render_rgb=False, render_depth=True, render_seg=True
-        )
-        warp.refit_bvh(*on_warp, context)
-        warp.render(*on_warp, context)
-        eye, bodies = data.camera("eye"), model.geom_bodyid[geoms]
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = eye.xmat.reshape(3, 3), eye.xpos
-        frames.append(
-            {  # as mjlab's CameraSensor views them
-                "depth": context.depth_data.numpy().reshape(height, width, 1),
-                "segmentation": context.seg_data.numpy().reshape(height, width, 2),
-                "camera_pose": pose,
-                "xpos": data.xpos[bodies].copy(),
-                "xquat": data.xquat[bodies].copy(),
-            }
-        )
-    K = intrinsics_from_fov(60.0, axis="vertical", height=height, width=width)
-    assert_warps("mjlab", frames, K, body_ids=geoms, static_ids=[0])
 
 
 def assert_warps(simulator, frames, K, differing=0.0, **options):
@@ -647,9 +594,8 @@ def test_genesis_itself(tmp_path):
     if importlib.util.find_spec("genesis") is None:
         pytest.skip("pip install genesis-world; it runs on a CPU, with EGL")
     # in a process of its own: a graphics driver that fails may take its process with it
-    environment = os.environ | {"PYOPENGL_PLATFORM": "egl"}
-    command = [sys.executable, "-c", GENESIS, str(tmp_path / "frames.pt")]
-    result = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500)
+    environment = ENVIRONMENT | {"PYOPENGL_PLATFORM": "egl"}
+    result = run_python("-c", GENESIS, tmp_path / "frames.pt", env=environment, timeout=500)
     if result.returncode != 0:
         pytest.skip(f"Genesis can't draw here: {result.stderr.strip().splitlines()[-1:]}")
     seen = torch.load(tmp_path / "frames.pt", weights_only=False)

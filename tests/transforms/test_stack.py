@@ -13,8 +13,7 @@ from torchrl.envs import TransformedEnv, check_env_specs
 from flowrep import geometry
 from flowrep.transforms import REPRESENTATIONS, Depth, Segmentation, representation_stack
 from flowrep.transforms.base import MissingKey
-from tests.transforms.fake_env import INTRINSICS, NUM_CLASSES, FakeSensorEnv
-from tests.transforms.test_base import moments
+from tests.transforms.fake_env import INTRINSICS, NUM_CLASSES, FakeSensorEnv, moments
 from tests.transforms.test_motion import wide_frames
 
 stack = functools.partial(representation_stack, intrinsics=INTRINSICS, num_classes=NUM_CLASSES)

@@ -1,8 +1,6 @@
 """Pictures: a colour means one thing everywhere, and what is written can be read back."""
 
 import colorsys
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -10,6 +8,7 @@ import torch
 
 from flowrep import viz
 from flowrep.viz import CLASS_COLOURS
+from tests.running import run_python
 
 
 def flow_of(u: float, v: float) -> np.ndarray:
@@ -207,5 +206,5 @@ def test_a_strip_of_narrow_pictures_has_no_wheels():
 def test_importing_viz_needs_numpy_alone():
     others = "{'PIL', 'imageio', 'matplotlib', 'torch', 'pybullet'}"
     code = f"import sys, flowrep.viz; print({others} & sys.modules.keys())"
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    found = run_python("-c", code, check=True)
     assert found.stdout.strip() == "set()"
