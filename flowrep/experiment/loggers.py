@@ -1,19 +1,22 @@
 """Where a run's numbers are plotted: TensorBoard and Weights & Biases."""
 
+from __future__ import annotations
+
 import re
 import uuid
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
-from typing import Any
-
-from torchrl.record.loggers import TensorboardLogger
+from typing import TYPE_CHECKING, Any
 
 from flowrep.experiment.lock import RunFolderError
 from flowrep.experiment.outcomes import OUTCOMES, EpisodeRecord
 from flowrep.extras import require
 from flowrep.files import naming, replace_text
+
+if TYPE_CHECKING:
+    from torchrl.record.loggers import TensorboardLogger
 
 
 class Loggers:
@@ -31,6 +34,8 @@ class Loggers:
             self._tensorboard = None
         with naming(events):
             if self._tensorboard is None:
+                from torchrl.record.loggers import TensorboardLogger
+
                 self._tensorboard = TensorboardLogger(events.name, str(self._folder))
             for logger in filter(None, (self._tensorboard, self._wandb)):
                 logger.log_metrics(dict(values), frames)
