@@ -14,7 +14,7 @@ from torchrl.data import Composite
 
 from flowrep.agent import CheckpointError, check_origin, load_checkpoint, save_checkpoint
 from flowrep.baselines import BASELINES
-from flowrep.config import UsageError
+from flowrep.config import UsageError, closest_first
 from flowrep.config.cli import composed
 from flowrep.config.schema import (
     EnvConfig,
@@ -259,7 +259,7 @@ def _pretrained(scene: Mapping[str, Any] | None) -> Path:
     files = {file.stem: file for file in PRETRAINED.glob("*.safetensors")}
     name = scene.get("name")
     if name not in files:
-        there = ", ".join(sorted(files))
+        there = closest_first(str(name), files)
         raise UsageError(f"no agent for scene '{name}' comes with flowrep; there are: {there}")
     return files[name]
 
