@@ -129,9 +129,10 @@ def is_a_mistake(error: Exception) -> bool:
 
 
 def _is_out_of_memory(error: Exception) -> bool:
-    # numpy and numba raise a MemoryError, torch a RuntimeError: a class of its own for GPUs alone
+    # of torch, for a GPU and on the CPU; numpy and numba raise a MemoryError
     is_gpu = type(error).__name__ == "OutOfMemoryError"
-    return isinstance(error, MemoryError) or is_gpu or "can't allocate memory" in str(error)
+    is_cpu = isinstance(error, RuntimeError) and "can't allocate memory" in str(error)
+    return isinstance(error, MemoryError) or is_gpu or is_cpu
 
 
 def checked(config: DictConfig, schema: type[Command]) -> Any:
@@ -180,6 +181,8 @@ def explained(error: Exception, schema: type[Command]) -> str:
     if _is_out_of_memory(error):
         reason = text.partition("\n")[0] or "MemoryError"
         return f"out of memory ({reason}): take fewer envs, a smaller camera, network or memory"
+    if isinstance(error, FileExistsError | NotADirectoryError):
+        return f"'{error.filename}': a file is where a folder should be; give another with output="
     choice = _UNKNOWN_CHOICE.match(text)
     if isinstance(error, MissingConfigException) and choice:
         group, name = choice.groups()

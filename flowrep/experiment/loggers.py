@@ -65,14 +65,15 @@ class Loggers:
         if mode == "off":
             return
         require(f"wandb={mode}", "train,wandb", "wandb")
-        from torchrl.record.loggers.wandb import WandbLogger
-
         kept = self._folder / "wandb_id"
         if not kept.is_file():
             replace_text(kept, uuid.uuid4().hex[:12])
         name = kept.read_text(encoding="utf-8")
         if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name):  # it becomes a part of paths
             raise RunFolderError(f"{kept} holds no id of a wandb run: restore it, or remove it")
+
+        from torchrl.record.loggers.wandb import WandbLogger
+
         self._wandb = WandbLogger(
             self._folder.name,
             project="flowrep",

@@ -125,6 +125,7 @@ def test_errors_of_the_command_are_lines_too_unless_they_are_bugs(monkeypatch, c
     monkeypatch.chdir(tmp_path)
     for error, code in (
         (OSError("no space"), 2),
+        (FileExistsError(17, "File exists", "out"), 2),
         (MemoryError(), 2),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory"), 2),
         (RuntimeError("a bug"), 1),
