@@ -42,10 +42,11 @@ def run(config: EvaluateConfig) -> None:
     If a folder is in use, or an agent can't be evaluated or saved, the others still are, and the
     exit code is 1. Baselines drive once in each scene.
     """
+    candidates = candidates_of(config)
+
     from flowrep.agent import keep_freed_memory
 
     keep_freed_memory()
-    candidates = candidates_of(config)
     evaluations: dict[str, PairedEvaluation] = {}
     failed: list[str] = []
     with StopRequest() as stop:
@@ -67,15 +68,19 @@ def run(config: EvaluateConfig) -> None:
 
 def candidates_of(config: EvaluateConfig) -> list[Candidate]:
     """Returns the agents to evaluate: of runs and sweeps, or policies from other projects."""
+    from flowrep.experiment.run import RunFolder, check_policy
+
+    runs: dict[Path, RunFolder] = {}  # each run once, even if it is named in several ways
+    for path in config.run or []:
+        for run in RunFolder.all_in(path):
+            runs.setdefault(run.path.resolve(), run)
+    for name in config.own_policies:
+        check_policy(name)
+
     from flowrep.experiment.agents import Agent
-    from flowrep.experiment.run import RunFolder
 
     machine = config.model_dump(include={"device", "num_envs", "num_workers"})
     if not config.own_policies:
-        runs: dict[Path, RunFolder] = {}  # each run once, even if it is named in several ways
-        for path in config.run or []:
-            for run in RunFolder.all_in(path):
-                runs.setdefault(run.path.resolve(), run)
         load = partial(Agent.load, scene=config.scene, trusted=config.trusted, **machine)
         return [Candidate(run, partial(load, run.path), config.policy) for run in runs.values()]
     keys = ("scene", "representations", "flow", "motion", "noise")

@@ -17,11 +17,13 @@ from flowrep.config.schema import ExportConfig
 
 def run(config: ExportConfig) -> None:
     """Writes the agent of a run as files that can be used without flowrep."""
-    from flowrep.experiment.agents import Agent
-    from flowrep.experiment.exported import export
     from flowrep.experiment.run import RunFolder
 
     run = RunFolder.existing(config.run)
+
+    from flowrep.experiment.agents import Agent
+    from flowrep.experiment.exported import export
+
     folder = Path(config.output or run.path / "export")
     agent = Agent.load(
         run.path,

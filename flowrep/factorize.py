@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 
 def factorize_recording(config: FactorizeConfig) -> int:
     """Writes raw, ego and object flow of a recording; returns the exit code."""
+    given = str(config.input)
+    if not (given.isdecimal() or Path(given).exists()):
+        raise UsageError(f"input={given}: no such file or folder")
     # OpenCV's messages about broken files would clutter the one-line error. It reads this as it is
     # imported, below; only newer versions can be silenced later.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")

@@ -42,6 +42,10 @@ FILES = ("sheet.png", "episode.mp4", "plan.png", "episodes.csv", "categories.csv
 
 def run(config: ViewConfig) -> None:
     """Writes pictures, a film and tables of the scene, or opens a window on it."""
+    from flowrep.experiment.run import check_policy
+
+    check_policy(config.policy)
+
     from flowrep.experiment.film import Film
     from flowrep.experiment.window import Keyboard, drive_by_hand
 

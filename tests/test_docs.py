@@ -1,9 +1,11 @@
 """The documentation: every transform has a page, what pages show runs, links lead somewhere."""
 
 import inspect
+import pkgutil
 import re
 import shlex
 import shutil
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -29,6 +31,7 @@ from flowrep.transforms import RawFlow
 from flowrep.transforms.hydra_configs import CONFIGS
 from tests.config.composing import plain
 from tests.running import run_python
+from tests.test_architecture import flowrep_imports
 from tests.transforms.fake_env import HEIGHT, WIDTH, FakeSensorEnv
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -63,6 +66,47 @@ def test_the_architecture_names_every_package_and_module():
     named = re.findall(r"`(\w+)`", " ".join(rows))
     there = [p.stem for p in PACKAGE.iterdir() if p.suffix == ".py" or (p / "__init__.py").exists()]
     assert sorted(named) == sorted({*there} - {"__init__", "conf"})
+
+
+def test_the_names_in_the_architecture_lead_somewhere():
+    text = (DOCS / "architecture.md").read_text("utf-8")
+    # `flowrep.train` or `experiment.build`; not `evaluation.csv`, `config.yaml` or a path
+    names = {name.removeprefix("flowrep.") for name in re.findall(r"`([\w.]+\.\w+)`", text)}
+    names -= {"evaluation.csv", "config.yaml"}
+    assert len(names) > 20
+    for name in names:
+        pkgutil.resolve_name(f"flowrep.{name}")
+
+
+def test_the_architecture_draws_what_imports_what():
+    svg = (DOCS / "images" / "architecture.svg").read_text("utf-8")
+    sides = r'<rect x="(\d+)" y="(\d+)" width="(\d+)" height="(\d+)" .*\n<text .*?>(.*)</text>'
+    boxes = {name: tuple(map(int, at)) for *at, name in re.findall(sides, svg) if at[0] != "0"}
+    owner = {part: name for name in boxes for part in name.split(" · ")}
+    packages = {path.parent.name for path in PACKAGE.glob("*/__init__.py")} - {"conf"}
+    assert owner.keys() == packages | {"train", "evaluate", "export", "view", "factorize"}
+
+    def box_at(x, y):
+        for name, (left, top, width, height) in boxes.items():
+            if left <= x <= left + width and top <= y <= top + height:
+                return name
+
+    arrows = set()
+    for line in re.findall(r'<path d="(M[\d ML]+)"/>', svg):
+        points = [tuple(map(int, point.split())) for point in re.split(r" ?[ML]", line)[1:]]
+        arrows.add((box_at(*points[0]), box_at(*points[-1])))
+    imports_of = {name: set() for name in boxes}
+    for path in PACKAGE.rglob("*.py"):
+        part = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+        if part in owner:
+            taken = {owner[each] for each in flowrep_imports(path) if each in owner}
+            imports_of[owner[part]] |= taken - {owner[part]}
+    assert arrows <= {(name, other) for name, others in imports_of.items() for other in others}
+    reached = {name: {other for one, other in arrows if one == name} for name in boxes}
+    for name in TopologicalSorter(reached).static_order():  # what a package imports comes first
+        reached[name] = reached[name].union(*(reached[other] for other in reached[name]))
+    missing = {name: others - reached[name] for name, others in imports_of.items()}
+    assert not any(missing.values()), missing
 
 
 def test_the_navigation_names_every_page_once():

@@ -150,7 +150,7 @@ def test_what_is_no_policy_or_path_is_named():
         with pytest.raises(UsageError, match=key):
             driven(config)
     with pytest.raises(UsageError, match="representations"):
-        driven(asked("policy=mine.py:make"))
+        driven(asked("policy=mine:make"))
 
 
 def test_the_path_can_be_chosen():

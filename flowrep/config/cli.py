@@ -25,11 +25,11 @@ from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.core.utils import env_override
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from yaml import YAMLError
 
 from flowrep import __version__
-from flowrep.config import CONF_DIR, UsageError, config_groups, group_choices
+from flowrep.config import CONF_DIR, UsageError, closest_first, config_groups, group_choices
 from flowrep.config.schema import Command, validated
 
 EXIT_USAGE = 2
@@ -37,6 +37,7 @@ FOLDERS = ("resume", "run", "input", "output", "hydra.run.dir", "hydra.sweep.dir
 """Keys whose values are folders, which may have any name."""
 OF_THE_MACHINE = ("device", "num_workers", "threads")
 """Keys that don't define a run and may change when it is resumed."""
+_UNKNOWN_CHOICE = re.compile(r"In '[^']*': Could not (?:find|load) '([^']+)/([^/']+)'")
 IS_DEBUGGING = bool(os.environ.get("HYDRA_FULL_ERROR"))
 
 
@@ -108,7 +109,14 @@ def end_with(error: Exception, schema: type[Command]) -> NoReturn:
     if IS_DEBUGGING or not is_a_mistake(error):
         traceback.print_exception(error)
         sys.exit(1)
-    exit_with(explained(error, schema))
+    text = explained(error, schema)
+    if choice := _UNKNOWN_CHOICE.match(str(error)):
+        group, name = choice.groups()
+        text += (
+            f". A choice of your own is a file {group}/{name.removesuffix('.yaml')}.yaml in a "
+            "folder that --config-dir names"
+        )
+    exit_with(text)
 
 
 def is_a_mistake(error: Exception) -> bool:
@@ -116,8 +124,15 @@ def is_a_mistake(error: Exception) -> bool:
     # BrokenExecutor: of a launcher whose worker was killed, as for want of memory
     libraries = HydraException, OmegaConfBaseException, YAMLError, BrokenExecutor
     is_plugin = str(error).startswith("Unknown plugin class")  # Hydra raises a RuntimeError
-    is_ours = type(error).__module__.startswith("flowrep.")
+    is_ours = type(error).__module__.startswith("flowrep.") or _is_out_of_memory(error)
     return isinstance(error, (*libraries, ValueError, ImportError, OSError)) or is_plugin or is_ours
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    # of torch, for a GPU and on the CPU; numpy and numba raise a MemoryError
+    is_gpu = type(error).__name__ == "OutOfMemoryError"
+    is_cpu = isinstance(error, RuntimeError) and "can't allocate memory" in str(error)
+    return isinstance(error, MemoryError) or is_gpu or is_cpu
 
 
 def checked(config: DictConfig, schema: type[Command]) -> Any:
@@ -163,14 +178,21 @@ def print_error(problem: str | Exception) -> None:
 def explained(error: Exception, schema: type[Command]) -> str:
     """Returns an error in a line; after a typo in a key or a choice, with what there is."""
     text = str(error)
-    missing = re.match(r"In '[^']*': Could not (?:find|load) '([^']+)/([^/']+)'", text)
-    if isinstance(error, MissingConfigException) and missing:
-        group, name = missing.groups()
-        there = ", ".join(sorted(error.options or group_choices(group)))
-        return (
-            f"unknown {group} '{name}'; there are: {there}. A choice of your own is a file "
-            f"{group}/{name.removesuffix('.yaml')}.yaml in a folder that --config-dir names"
-        )
+    if _is_out_of_memory(error):
+        reason = text.partition("\n")[0] or "MemoryError"
+        return f"out of memory ({reason}): take fewer envs, a smaller camera, network or memory"
+    if isinstance(error, FileExistsError | NotADirectoryError):
+        return f"'{error.filename}': a file is where a folder should be; give another with output="
+    choice = _UNKNOWN_CHOICE.match(text)
+    if isinstance(error, MissingConfigException) and choice:
+        group, name = choice.groups()
+        there = closest_first(name, error.options or group_choices(group))
+        return f"unknown {group} '{name}'; there are: {there}"
+    if isinstance(error, MissingMandatoryValue):
+        return _needed(str(error.full_key), schema)
+    if needed := re.match(r"You must specify '([^']+)'", text):
+        there = ", ".join(group_choices(needed[1]))
+        return f"{_needed(needed[1], schema)}; choices of {needed[1]}: {there}"
     unknown = re.match(r"Could not (?:override|delete from config\.) '([^']+)'", text)
     if unknown:
         return _unknown_key(unknown[1], schema)
@@ -179,17 +201,28 @@ def explained(error: Exception, schema: type[Command]) -> str:
     return text
 
 
+def _needed(key: str, schema: type[Command]) -> str:
+    """Returns that a key needs a value, with the first line of the command's file in conf/."""
+    example = (CONF_DIR / f"{_name(schema)}.yaml").read_text("utf-8").partition("\n")[0]
+    return f"{key} needs a value, for example: {example.removeprefix('# ')}"
+
+
+def _name(schema: type[Command]) -> str:
+    """Returns the name of a command, which its file in conf/ has, too."""
+    return schema.__name__.removesuffix("Config").lower()
+
+
 def _unknown_key(key: str, schema: type[Command]) -> str:
     """Returns that there is no such key, and the sections that have one, or all keys."""
     if "." in key:
-        return f"unknown key '{key}': --cfg job shows the keys that there are"
+        return f"unknown key '{key}'; python -m flowrep.{_name(schema)} --cfg job shows all keys"
     groups = [group for group in config_groups() if group in schema.model_fields]
     files = [(group, path) for group in groups for path in CONF_DIR.glob(f"{group}/**/*.yaml")]
     line = re.compile(rf"^{re.escape(key)}:", re.MULTILINE)
     meant = sorted({f"{g}.{key}" for g, path in files if line.search(path.read_text("utf-8"))})
     keys = [*schema.model_fields, *(("preset", "debug") if "resume" in schema.model_fields else ())]
-    hint = f"do you mean {' or '.join(meant)}?" if meant else f"there are: {', '.join(keys)}"
-    return f"unknown key '{key}'; {hint}"
+    there = f"there are: {closest_first(key, keys)}"
+    return f"unknown key '{key}'; " + (f"do you mean {' or '.join(meant)}?" if meant else there)
 
 
 def _show_if_asked(arguments: Sequence[str], config_name: str) -> None:

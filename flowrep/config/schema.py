@@ -371,7 +371,10 @@ def validated(schema: type[Model], plain: Mapping[str, Any], source: str = "") -
     try:
         return schema.model_validate(plain)
     except ValidationError as error:
-        lines = [_line(details) for details in error.errors(include_url=False)]
+        errors = error.errors(include_url=False)
+        if source and (absent := [_key(each) for each in errors if each["type"] == "missing"]):
+            raise UsageError(f"{source} lacks {', '.join(absent)}; restore the file") from None
+        lines = map(_line, errors)
         raise UsageError("\n".join(f"{source}: {x}" if source else x for x in lines)) from None
 
 
@@ -411,9 +414,13 @@ def check_options(maker: type, options: Mapping[str, Any], section: str) -> None
     validated(create_model("Config", **whole), {section: options})
 
 
+def _key(details: Any) -> str:
+    return ".".join(str(part) for part in details["loc"] if part not in _MEMBERS)
+
+
 def _line(details: Any) -> str:
     """Returns pydantic's error in a line that begins with the key."""
-    key = ".".join(str(part) for part in details["loc"] if part not in _MEMBERS)
+    key = _key(details)
     kind, value = details["type"], details["input"]
     message = details["msg"].removeprefix("Value error, ")
     if kind == "extra_forbidden":

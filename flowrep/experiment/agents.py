@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 from torchrl.data import Composite
 
-from flowrep.agent import CheckpointError, load_checkpoint, save_checkpoint
+from flowrep.agent import CheckpointError, check_origin, load_checkpoint, save_checkpoint
 from flowrep.baselines import BASELINES
-from flowrep.config import UsageError
+from flowrep.config import UsageError, closest_first
 from flowrep.config.cli import composed
 from flowrep.config.schema import (
     EnvConfig,
@@ -30,7 +30,7 @@ from flowrep.experiment import build
 from flowrep.experiment.evaluation import Driver, PairedEvaluation
 from flowrep.experiment.external import Task, check_card, load_policy
 from flowrep.experiment.outcomes import EpisodeRecord
-from flowrep.experiment.run import RunFolder, check_origin, origin_of
+from flowrep.experiment.run import RunFolder, check_policy, origin_of
 from flowrep.experiment.runner import EVALUATION_ENVS, Runner
 from flowrep.progress import StopRequest
 from flowrep.scenes import load_scene
@@ -123,7 +123,7 @@ class Agent(Driver):
             UsageError: there is no such agent.
             CheckpointError: a file is damaged, or the agent can't act in this scene.
         """
-        name = str(name)
+        check_policy(name := str(name))
         machine: dict[str, Any] = {"device": device, "num_workers": num_workers}
         machine |= {} if num_envs is None else {"num_envs": num_envs}
         if isinstance(scene, str):
@@ -238,11 +238,6 @@ def _stored(
         stored = load_checkpoint(path, ["config", "frames", "policy"])
         config = validated_run(stored["config"], path.name, trusted)
         return config, stored["frames"], unpacked(_weights(stored, path))
-    if not is_folder:
-        raise UsageError(
-            f"policy={name}: give {', '.join(BASELINES)}, pretrained, a run's folder, "
-            "path.safetensors, path.py:make, package.module:make or path.pt2"
-        )
     run = RunFolder.existing(name)
     config, path = run.config(trusted), run.checkpoint_path
     state = load_checkpoint(path, ["origin", "frames", "policy"])
@@ -264,7 +259,7 @@ def _pretrained(scene: Mapping[str, Any] | None) -> Path:
     files = {file.stem: file for file in PRETRAINED.glob("*.safetensors")}
     name = scene.get("name")
     if name not in files:
-        there = ", ".join(sorted(files))
+        there = closest_first(str(name), files)
         raise UsageError(f"no agent for scene '{name}' comes with flowrep; there are: {there}")
     return files[name]
 

@@ -1,4 +1,4 @@
-"""An agent as files that can be used without flowrep; `load_agent.py` beside it is one of them."""
+"""An agent as files that can be used without flowrep; `exported_loader.py` is one of them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torchrl.data import Composite
 from flowrep import __version__
 from flowrep.agent.networks import PolicyNetwork
 from flowrep.envs import street_envs
-from flowrep.experiment import load_agent
+from flowrep.experiment import exported_loader
 from flowrep.experiment.evaluation import Driver
 from flowrep.experiment.external import CARD, LOADER, PROGRAM
 from flowrep.files import replace_files
@@ -92,7 +92,7 @@ def write_agent(folder: Path, program: ExportedProgram, card: Mapping[str, Any])
     # they reveal damage, which torch.export.load does not look for
     digests = {name: zlib.crc32(data) for name, data in files.items()}
     digests[CARD] = zlib.crc32(json.dumps(dict(card)).encode())
-    files[LOADER] = Path(load_agent.__file__).read_bytes()  # no digest, as it may be edited
+    files[LOADER] = Path(exported_loader.__file__).read_bytes()  # no digest, as it may be edited
     files[CARD] = (json.dumps({**card, "crc32": digests}, indent=2) + "\n").encode()
     folder.mkdir(parents=True, exist_ok=True)
     replace_files(folder, files, as_one=True)

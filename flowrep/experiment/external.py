@@ -1,6 +1,7 @@
 """Policies from other projects: scripts, modules and programs, and agents that were exported."""
 
 import json
+import logging
 import math
 import re
 import shlex
@@ -121,9 +122,19 @@ def _module(name: str) -> Any:
 
 
 def _program(path: str, task: Task) -> Callable[[TensorDictBase], Tensor]:
-    Path(path).resolve(strict=True)  # torch would log a traceback of a missing file
+    Path(path).resolve(strict=True)
+    logger = logging.getLogger("torch.export")  # prints the traceback of a damaged file
+    was_disabled, logger.disabled = logger.disabled, True
+    try:
+        loaded = torch.export.load(path)
+    except Exception as error:
+        raise PolicyError(
+            "is damaged, or was not saved by torch.export.save of this PyTorch; save it again"
+        ) from error
+    finally:
+        logger.disabled = was_disabled
     # moving the module alone would leave the devices that are written in its graph
-    program = move_to_device_pass(torch.export.load(path), task.device).module()
+    program = move_to_device_pass(loaded, task.device).module()
     card = _card(path)
     names = task.representations if card is None else [each["name"] for each in card["maps"]]
     return lambda maps: program(*(maps[name] for name in names)).argmax(-1)

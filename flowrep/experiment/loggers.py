@@ -1,19 +1,22 @@
 """Where a run's numbers are plotted: TensorBoard and Weights & Biases."""
 
+from __future__ import annotations
+
 import re
 import uuid
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
-from typing import Any
-
-from torchrl.record.loggers import TensorboardLogger
+from typing import TYPE_CHECKING, Any
 
 from flowrep.experiment.lock import RunFolderError
 from flowrep.experiment.outcomes import OUTCOMES, EpisodeRecord
 from flowrep.extras import require
 from flowrep.files import naming, replace_text
+
+if TYPE_CHECKING:
+    from torchrl.record.loggers import TensorboardLogger
 
 
 class Loggers:
@@ -31,6 +34,8 @@ class Loggers:
             self._tensorboard = None
         with naming(events):
             if self._tensorboard is None:
+                from torchrl.record.loggers import TensorboardLogger
+
                 self._tensorboard = TensorboardLogger(events.name, str(self._folder))
             for logger in filter(None, (self._tensorboard, self._wandb)):
                 logger.log_metrics(dict(values), frames)
@@ -60,14 +65,15 @@ class Loggers:
         if mode == "off":
             return
         require(f"wandb={mode}", "train,wandb", "wandb")
-        from torchrl.record.loggers.wandb import WandbLogger
-
         kept = self._folder / "wandb_id"
         if not kept.is_file():
             replace_text(kept, uuid.uuid4().hex[:12])
         name = kept.read_text(encoding="utf-8")
         if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name):  # it becomes a part of paths
             raise RunFolderError(f"{kept} holds no id of a wandb run: restore it, or remove it")
+
+        from torchrl.record.loggers.wandb import WandbLogger
+
         self._wandb = WandbLogger(
             self._folder.name,
             project="flowrep",

@@ -1,4 +1,10 @@
-"""A run's folder: its config, tables of metrics and episodes, and checkpoint."""
+"""A run's folder: its config, tables of metrics and episodes, and checkpoint.
+
+Commands look for the folders that they are given before they import PyTorch, and so does a report:
+what needs it is imported where it is used.
+"""
+
+from __future__ import annotations
 
 import json
 import os
@@ -8,19 +14,16 @@ import subprocess
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
-import torch
 import yaml
 from numpy.typing import NDArray
 
 from flowrep import __version__
-from flowrep.agent import CheckpointError
 from flowrep.config import UsageError
-from flowrep.config.schema import TrainConfig, validated_run
+from flowrep.config.schema import BaselineName, TrainConfig, validated_run
 from flowrep.config.yaml_file import read_yaml
-from flowrep.experiment import build
 from flowrep.experiment.lock import FolderLock, RunFolderError, locked
 from flowrep.experiment.loggers import Loggers
 from flowrep.experiment.outcomes import (
@@ -31,6 +34,9 @@ from flowrep.experiment.outcomes import (
 )
 from flowrep.files import replace_file, replace_text, set_aside
 from flowrep.tables import append_rows, is_whole, read_rows, write_rows
+
+if TYPE_CHECKING:
+    import torch
 
 _EPISODE = ("scene", "scene_id", "frames", "evaluation", "policy", "speed", "fps", "episode_seed")
 """The columns that identify a row of evaluation.csv."""
@@ -50,34 +56,26 @@ def origin_of(config: Mapping[str, Any]) -> dict[str, Any]:
     return {"flowrep": __version__, **parts}
 
 
-def check_origin(saved: Mapping[str, Any], expected: Mapping[str, Any], path: Path) -> None:
-    """Checks that a checkpoint belongs to a run; the error names the first difference."""
-    if saved.get("flowrep") != expected["flowrep"]:
-        raise CheckpointError(
-            f"{path} was written by flowrep {saved.get('flowrep')}, this is {expected['flowrep']}: "
-            "install that version, or start a new run"
+def check_policy(name: str) -> None:
+    """Checks that there is what `policy=` names, as far as that shows without PyTorch."""
+    if Path(name).is_dir() or name in (*get_args(BaselineName), "pretrained"):
+        return
+    script, is_reference, _ = name.rpartition(":")
+    file, ends = (script, (".py",)) if is_reference else (name, (".pt2", ".safetensors"))
+    if file.endswith(ends):
+        if not Path(file).is_file():
+            raise UsageError(f"policy={name}: there is no file '{file}'")
+    elif not is_reference:
+        raise UsageError(
+            f"policy={name}: give {', '.join(get_args(BaselineName))}, pretrained, a run's folder, "
+            "path.safetensors, path.py:make, package.module:make or path.pt2"
         )
-    there, here = _flat(saved), _flat(expected)
-    for key in {**there, **here}:
-        was, now = there.get(key, "absent"), here.get(key, "absent")
-        if was != now:
-            raise CheckpointError(
-                f"{path} belongs to a run with {key}={was}, the config.yaml of its folder says "
-                f"{key}={now}: restore the file that was there, or start a new run"
-            )
-
-
-def _flat(config: Mapping[str, Any], section: str = "") -> dict[str, Any]:
-    """Returns nested values by their dotted keys; an empty mapping is a value."""
-    flat: dict[str, Any] = {}
-    for key, value in config.items():
-        nested = _flat(value, f"{section}{key}.") if isinstance(value, Mapping) else {}
-        flat |= nested or {f"{section}{key}": value}
-    return flat
 
 
 def machine_of(precision: torch.dtype) -> dict[str, Any]:
     """Returns what computes a run: versions, commit, processor and number format."""
+    import torch
+
     home, commit = Path(__file__).parents[2], None
     if (home / ".git").exists() and shutil.which("git"):
         ask = ["git", "-C", str(home), "describe", "--always", "--dirty", "--abbrev=40"]
@@ -119,7 +117,7 @@ class RunFolder:
         self._lock: FolderLock | None = None
 
     @classmethod
-    def existing(cls, path: str | Path) -> "RunFolder":
+    def existing(cls, path: str | Path) -> RunFolder:
         """Opens the folder of an existing run."""
         if not (Path(path) / "config.yaml").is_file():
             raise RunFolderError(
@@ -129,7 +127,7 @@ class RunFolder:
         return cls(path)
 
     @classmethod
-    def all_in(cls, path: str | Path) -> list["RunFolder"]:
+    def all_in(cls, path: str | Path) -> list[RunFolder]:
         """Opens a run's folder, or all run folders in a sweep's folder."""
         runs = sorted(config.parent for config in Path(path).glob("*/config.yaml"))
         is_sweep = runs and not (Path(path) / "config.yaml").is_file()
@@ -173,6 +171,8 @@ class RunFolder:
 
     def begin(self, config: TrainConfig, overrides: Iterable[str]) -> TrainConfig:
         """Writes the config of a new run, in which `precision=auto` is resolved, and returns it."""
+        from flowrep.experiment import build
+
         self.check_is_new()
         config = build.with_precision(config)
         self.write_config(config.plain(), overrides)

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from flowrep.agent import (
     DivergenceError,
+    check_origin,
     keep_freed_memory,
     load_checkpoint,
     save_checkpoint,
@@ -28,7 +29,7 @@ from flowrep.envs.workers import sheltered
 from flowrep.experiment import build
 from flowrep.experiment.evaluation import Driver, PairedEvaluation
 from flowrep.experiment.outcomes import OUTCOMES, print_results
-from flowrep.experiment.run import RunFolder, check_origin, machine_of, origin_of
+from flowrep.experiment.run import RunFolder, machine_of, origin_of
 from flowrep.progress import Every, StopRequest, Stopwatch, progress_bar
 
 EVALUATION_ENVS = 192  # side by side at least: more make a step of each cheaper

@@ -1,6 +1,6 @@
 """Reports on runs: `python -m flowrep.report outputs/<sweep>`.
 
-Slow imports wait until the config has been checked.
+Slow imports wait until the config has been checked and the runs have been read.
 """
 
 from __future__ import annotations
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 def report(config: ReportConfig) -> Path:
     """Writes figures, tables and a page of runs; returns the page's path."""
-    from flowrep.report.page import drives_of, render_page, summary
-    from flowrep.report.sections import assemble, write_files
     from flowrep.report.storage import is_archive, read_runs, without_repeats
 
     folders = list(map(Path, config.run))
@@ -36,6 +34,10 @@ def report(config: ReportConfig) -> Path:
         print(f"left out: {warning}")
     if not runs:
         raise UsageError("none of the runs can be read, see above")
+
+    from flowrep.report.page import drives_of, render_page, summary
+    from flowrep.report.sections import assemble, write_files
+
     print(summary(runs))
     assembled = assemble(runs, warnings, config.policy)
     for warning in assembled.warnings[len(warnings) :]:

@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # its parts load at first use: a mistyped folder need not wait for them
 from numpy.typing import NDArray
-from scipy import stats
 
 Array = NDArray[np.float64]
 
@@ -43,7 +43,7 @@ class Effect(NamedTuple):
         """Two-sided p of no difference; nan if the runs don't spread, so that p is unknown."""
         if self.error == 0:
             return 1.0 if self.value == 0 else float("nan")
-        return float(2 * stats.t.sf(abs(self.value) / self.error, self.freedom))
+        return float(2 * scipy.stats.t.sf(abs(self.value) / self.error, self.freedom))
 
     def p_within(self, margin: float) -> float:
         """Returns p of two one-sided tests that the difference is smaller than a margin."""
@@ -60,7 +60,7 @@ class Effect(NamedTuple):
         """Returns the difference with its 95 % interval, which excludes 0 exactly if p < 0.05."""
         if self.error == 0:
             return Estimate(self.value, float("nan"), float("nan"))
-        half = self.error * float(stats.t.ppf(1 - LEVEL / 2, self.freedom))
+        half = self.error * float(scipy.stats.t.ppf(1 - LEVEL / 2, self.freedom))
         return Estimate(self.value, self.value - half, self.value + half)
 
     def verdict(self, p_value: float) -> str:
@@ -130,7 +130,7 @@ def mean_share(scenes: Sequence[Array], episodes: int = 0) -> Estimate:
     """
     mean = effect([(rates,) for rates in scenes])
     if episodes and not mean.error > 0:
-        test = stats.binomtest(round(mean.value * episodes), episodes)
+        test = scipy.stats.binomtest(round(mean.value * episodes), episodes)
         return Estimate(mean.value, *test.proportion_ci(1 - LEVEL, method="wilson"))
     value, low, high = mean.interval()
     return Estimate(value, max(low, 0.0), min(high, 1.0))

@@ -10,7 +10,7 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from flowrep.config import CONF_DIR, UsageError
+from flowrep.config import CONF_DIR, UsageError, closest_first
 from flowrep.config.yaml_file import read_yaml
 from flowrep.scenes.checks import check_path, check_references, check_walks
 from flowrep.scenes.layout import Layout
@@ -37,7 +37,7 @@ def load_scene(scene: str | Path | Mapping[str, Any] | Scene) -> Scene:
     path = Path(scene)
     if path.suffix not in (".yaml", ".yml"):
         if str(scene) not in scene_names():
-            known = ", ".join(scene_names())
+            known = closest_first(str(scene), scene_names())
             raise SceneError(f"unknown scene {str(scene)!r}; choose one of {known}, or a YAML file")
         path = CONF_DIR / "scene" / f"{scene}.yaml"
     try:

@@ -81,6 +81,7 @@ NotNegative = Annotated[float, Strict(), Field(ge=0.0)]
 Angle = Annotated[float, Strict(), Field(ge=-360.0, le=360.0)]
 HouseSide = Annotated[float, Strict(), Field(ge=1.0)]  # rows are filled house by house
 Count = Annotated[int, Strict(), Field(ge=1)]
+Pixels = Annotated[int, Strict(), Field(ge=1, le=4096)]  # 4K; more ends in a MemoryError
 Whole = Annotated[int, Strict(), Field(ge=0)]
 Name = Annotated[str, StringConstraints(min_length=1)]
 FileName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
@@ -103,8 +104,8 @@ class Part:
 class CameraConfig(Part):
     """A camera on the vehicle: `fov_deg` is vertical, `pitch_deg` is positive upwards."""
 
-    height_px: Count
-    width_px: Count
+    height_px: Pixels
+    width_px: Pixels
     fov_deg: Annotated[float, Strict(), Field(ge=1.0, le=179.0)]
     mount_height_m: Positive
     mount_forward_m: Number

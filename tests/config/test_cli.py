@@ -45,6 +45,7 @@ def run(monkeypatch, capsys, tmp_path):
 MISTAKES = [
     # a choice that doesn't exist
     ("train representations=[eggo]", ["eggo", "ego", "depth2", "seg"]),
+    ("train scene=strait_road", ["strait_road", "straight_road, h_shaped", "--config-dir"]),
     ("train hydra/launcher=joblb", ["joblb", "basic"]),
     ("train -m representations=[ego],[raw,eggo]", ["eggo", "depth2"]),
     ("train scene=my/x.yaml", ["my/x.yaml", "--config-dir", "s_turn"]),
@@ -61,7 +62,9 @@ MISTAKES = [
     ("train ~algorithm", ["preset"]),
     ("train total_frames=???", ["total_frames"]),
     ("factorize input=x output=y format=sintel", ["format.scene"]),
-    ("report", ["run"]),
+    ("report", ["run", "python -m flowrep.report outputs/"]),
+    ("factorize", ["format", "sevenscenes", "python -m flowrep.factorize input=<folder>"]),
+    ("factorize format=tum", ["input", "python -m flowrep.factorize input=<folder>"]),
     # what Hydra can't read, or a shell has split
     ("train 'representations=[ego,' 'obj]'", ["representations=[ego,", "representations=[a,b]"]),
     ("evaluate run=a 'speed=[low,' 'high]'", ["speed=[low,", "speed=[a,b]"]),
@@ -120,7 +123,14 @@ def test_what_hydra_accepts_passes(run, line):
 
 def test_errors_of_the_command_are_lines_too_unless_they_are_bugs(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
-    for error, code in ((OSError("no space"), 2), (KeyError("a bug"), 1)):
+    for error, code in (
+        (OSError("no space"), 2),
+        (FileExistsError(17, "File exists", "out"), 2),
+        (MemoryError(), 2),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory"), 2),
+        (RuntimeError("a bug"), 1),
+        (KeyError("a bug"), 1),
+    ):
         monkeypatch.setattr(sys, "argv", ["flowrep-train"])
 
         def fails(config, error=error):

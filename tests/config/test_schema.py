@@ -141,6 +141,9 @@ def test_what_is_wrong_in_a_run_folder_is_named_with_the_file():
     config["algorithm"]["n_steps"] = 0
     with pytest.raises(UsageError, match=r"^config.yaml: algorithm.n_steps"):
         validated_run(config, "config.yaml")
+    del config["seed"], config["evaluation"]["video"]
+    with pytest.raises(UsageError, match=r"^config.yaml lacks seed, evaluation.video; [^\n]*$"):
+        validated_run(config, "config.yaml")
     with pytest.raises(UsageError, match=r"config.yaml"):
         validated_run(None, "config.yaml")
 

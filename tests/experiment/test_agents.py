@@ -97,7 +97,7 @@ def test_baselines_drive_the_same_episodes(trained):
     [
         ({"speed": "fast"}, "speed"),
         ({"sceen": "s_turn"}, "sceen"),
-        ({"scene": "t_turn"}, "t_turn"),
+        ({"scene": "t_turn"}, "t_turn'; there are: s_turn, .*three_way_junction$"),  # no option
         ({"algorithm.tua": 0.1}, "algorithm.tua"),
         ({"resume": "outputs/first"}, "resume="),
         ({"representations": None}, "group"),

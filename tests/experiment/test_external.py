@@ -2,6 +2,7 @@
 
 import json
 import shlex
+import zipfile
 from dataclasses import replace
 
 import pytest
@@ -125,6 +126,18 @@ def test_what_is_not_there_or_damaged_is_named(name, tmp_path):
     for each in (name, f"{tmp_path}/agent.pt2"):
         with pytest.raises(PolicyError, match=each.partition(".")[0]):
             load_policy(each, TASK)
+
+
+@pytest.mark.parametrize("kind", ["text", "zip"])
+def test_of_a_program_that_is_none_nothing_is_logged(kind, tmp_path, caplog):
+    path = tmp_path / "agent.pt2"
+    path.write_text("something else")
+    if kind == "zip":
+        with zipfile.ZipFile(path, "w") as file:
+            file.writestr("agent/version", "3")
+    with pytest.raises(PolicyError, match=str(path)):
+        load_policy(str(path), TASK)
+    assert not caplog.records
 
 
 # An exported agent on maps other than its own is refused, with what it takes to put it right.

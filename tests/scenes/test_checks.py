@@ -71,6 +71,7 @@ def refusal(data, changes):
         ({"pedestrian_groups.1.walk": POINTS}, "pedestrian_groups[1].walk"),
         ({"categories.1": "sky"}, "categories"),
         ({"zones.1.name": "south"}, "zones"),
+        ({"camera.width_px": 1_000_000}, "camera.width_px"),  # such maps are TB
         # Names of nothing, and places off their road.
         ({"pedestrian_groups.0.count": 84}, "pedestrian_groups"),
         ({"categories.0": "heaven"}, "categories"),
