@@ -23,7 +23,7 @@ import imageio.v3 as imageio
 from flowrep.config import CONF_DIR, UsageError, group_choices
 from flowrep.config.schema import FactorizeConfig, validated
 from flowrep.factorize import factorize_recording, main
-from flowrep.sequences import Frame, SequenceError, read_flow, recorded_motion
+from flowrep.sequences import Frame, SequenceError, open_recording, read_flow, recorded_motion
 from flowrep.sequences.declared import declaration
 from flowrep.sequences.job import Job
 from flowrep.sequences.output import Output
@@ -335,15 +335,18 @@ def run(monkeypatch, *arguments) -> int:
     return ended.value.code
 
 
-@pytest.mark.parametrize("format", ["frames", "tum", "sevenscenes", "replica", "kitti"])
-def test_a_wrong_folder_is_told_what_was_expected(format, tmp_path, monkeypatch, capsys):
-    (tmp_path / "in").mkdir()
-    given = [f"format={format}", f"input={tmp_path / 'in'}", f"output={tmp_path / 'out'}"]
-    assert run(monkeypatch, *given) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    expected = {"frames": "depth/*, ", "tum": "depth.txt", "sevenscenes": "*.pose.txt"}
-    assert expected.get(format, {"replica": "traj.txt", "kitti": "image_2"}.get(format)) in line
-    assert "Errno" not in line
+EXPECTED = {
+    "frames": "depth/*, ", "tum": "depth.txt", "sevenscenes": "*.pose.txt", "replica": "traj.txt",
+    "kitti": "image_2",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("format", EXPECTED)
+def test_a_wrong_folder_is_told_what_was_expected(format, tmp_path):
+    with pytest.raises(SequenceError) as refused:
+        open_recording(tmp_path, format)
+    assert EXPECTED[format] in str(refused.value)
+    assert "Errno" not in str(refused.value)
 
 
 def test_a_format_of_ones_own_says_what_is_different(moments, tmp_path, monkeypatch):
