@@ -96,7 +96,7 @@ def test_all_that_is_written(moments, tmp_path):
         assert float(row["raw_median_px_per_s"]) == pytest.approx(10 * float(row["raw_median_px"]))
     lines = np.loadtxt(out / "trajectory.txt")
     np.testing.assert_allclose(lines[:, 0], [0.0, 0.1, 0.2])
-    for line, moment in zip(lines, moments):
+    for line, moment in zip(lines, moments, strict=True):
         np.testing.assert_allclose(line[1:4], moment.world_from_cam[:3, 3], atol=1e-6)
         expected = synthetic.quaternion_line(moment.world_from_cam).split()
         np.testing.assert_allclose(line[4:], [float(x) for x in expected[3:]], atol=1e-6)
@@ -193,7 +193,7 @@ def test_what_cannot_be_factorised_is_named_and_leaves_nothing(moments, tmp_path
 def test_an_estimated_trajectory_begins_with_the_recorded_pose(moments, tmp_path):
     options = ["poses=estimated", "video=false", "flow_files=[]"]
     _, out = factorize(tmp_path, "flow=exact", *options)
-    for line, moment in zip(np.loadtxt(out / "trajectory.txt"), moments):
+    for line, moment in zip(np.loadtxt(out / "trajectory.txt"), moments, strict=True):
         np.testing.assert_allclose(line[1:4], moment.world_from_cam[:3, 3], atol=2e-3)
 
 

@@ -140,6 +140,8 @@ def test_sintels_focal_length_may_grow(tmp_path):
             flow = brute_force(moment.depth, cameras[i], moment.world_from_cam, *next_one)
             put(tmp_path / f"flow/cave/frame_{i + 1:04d}.flo", -flow.astype(np.float32))
     recording = open_recording(tmp_path, "sintel", scene="cave", backwards=True)
-    for made in [*factorize_frames(recording, recorded_flow)][1:]:
+    _, *pairs = factorize_frames(recording, recorded_flow)
+    assert len(pairs) == len(moments) - 1
+    for made in pairs:
         assert made.valid.all()
         assert np.abs(made.obj).max() < 1e-3  # with the current K alone it would be 0.2 px

@@ -100,8 +100,7 @@ def test_what_was_written_is_read_and_object_flow_equals_the_truth(name, tmp_pat
     source = recorded_flow if has_flow else lambda previous, current: next(truth).raw
     first, *others = factorize_frames(recording, source)
     assert first is None
-    assert len(others) == len(moments) - 1
-    for made, moment in zip(others, ordered[1:]):
+    for made, moment in zip(others, ordered[1:], strict=True):
         known = np.isfinite(moment.depth)
         np.testing.assert_array_equal(made.valid, known)
         error = np.abs(made.obj - moment.obj)[:, known]
@@ -170,7 +169,8 @@ def test_zed_poses_in_another_coordinate_system(tmp_path):
     flu_from_opencv = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
     poses = [moment.world_from_cam @ flu_from_opencv.T for moment in moments]
     synthetic.put(tmp_path / "poses.txt", map(synthetic.quaternion_line, poses))
-    for frame, moment in zip(open_recording(tmp_path, "zed", pose_axes="x_forward_z_up"), moments):
+    recording = open_recording(tmp_path, "zed", pose_axes="x_forward_z_up")
+    for frame, moment in zip(recording, moments, strict=True):
         np.testing.assert_allclose(frame.world_from_cam, moment.world_from_cam, atol=1e-7)
 
 
