@@ -161,14 +161,6 @@ def test_a_list_that_a_config_holds_twice_is_read_again(tmp_path):
 # Links.
 
 
-@pytest.fixture
-def victim(tmp_path):
-    path = tmp_path / "elsewhere" / "victim"
-    path.parent.mkdir()
-    path.write_text("frames,alpha\n1,2\n")
-    return path
-
-
 WRITES = {
     "metrics.csv": lambda run: run.log_metrics(10, {"alpha": 0.5}),
     "evaluation.csv": lambda run: run.save_episodes([episode(1)]),
