@@ -367,4 +367,4 @@ def test_a_policy_without_actions_leaves_a_line_and_no_row(tmp_path, capsys):
 
 def test_a_runs_folder_is_no_place_for_the_rows_of_another_policy(run):
     with pytest.raises(UsageError, match="output"):
-        own("mine.py:make", run.path, "representations=[seg]")
+        own("examples/own_policy.py:make", run.path, "representations=[seg]")
