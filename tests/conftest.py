@@ -125,3 +125,12 @@ def short_folder():
     """A folder for what commands leave in TMPDIR: sockets want a short path."""
     with tempfile.TemporaryDirectory(prefix="fr") as folder:
         yield Path(folder)
+
+
+@pytest.fixture
+def victim(tmp_path):
+    """A table of the user's, which links of a stranger point at."""
+    path = tmp_path / "elsewhere" / "victim"
+    path.parent.mkdir()
+    path.write_text("frames,alpha\n1,2\n")
+    return path

@@ -239,7 +239,6 @@ def test_an_evaluation_that_was_stopped_keeps_whole_groups_and_leaves_no_trace_o
     some, driver, worker_processes, number, num_workers
 ):
     (whole, folder), config = some("good_1", "good_2", overrides=MANY)
-    config = config.model_copy(update={"num_workers": num_workers})
     evaluate(config.model_copy(update={"run": [str(whole.path)]}))
     rows = whole.read_episodes()
     assert len(rows) == 32
@@ -250,12 +249,12 @@ def test_an_evaluation_that_was_stopped_keeps_whole_groups_and_leaves_no_trace_o
 
     driver.at, driver.act = driver.steps + STEPS_OF_A_GROUP, signal_all
     again = config.model_copy(update={"run": [str(folder.path)]})
-    worker_processes.clear()
     with pytest.raises(SystemExit) as ended:
-        evaluate(again)
+        evaluate(again.model_copy(update={"num_workers": num_workers, "video": 1}))
     assert len(worker_processes) == num_workers
     assert ended.value.code == 128 + number
     assert folder.read_episodes() == of_low_speed(rows)
+    assert not (folder.path / "videos").exists()
     failures = read_rows(folder.failures_path)
     assert [(row["speed"], row["policy"], row["episodes"]) for row in failures] == [
         ("low", "greedy", "8")
@@ -274,22 +273,6 @@ def test_a_worker_that_is_killed_is_named_and_what_ended_before_is_kept(
     rows = folder.read_episodes()
     assert len(rows) == 8
     assert rows == of_low_speed(rows)
-
-
-def test_ctrl_c_keeps_what_was_run_and_says_so_to_the_shell(some, monkeypatch):
-    class Interrupted(BaselinePolicy):
-        def __call__(self, tensordict):
-            if tensordict["is_init"].any():  # once
-                os.kill(os.getpid(), signal.SIGINT)
-            return super().__call__(tensordict)
-
-    monkeypatch.setattr("flowrep.experiment.evaluation.BaselinePolicy", Interrupted)
-    (folder,), config = some("good", overrides=["baselines=[random]", "episodes=1", "video=1"])
-    with pytest.raises(SystemExit) as ended:
-        evaluate(config)
-    assert ended.value.code == 130
-    assert [row["policy"] for row in folder.read_episodes()] == ["greedy"]
-    assert not (folder.path / "videos").exists()
 
 
 def test_a_stop_ends_between_two_films(some, monkeypatch):
@@ -384,4 +367,4 @@ def test_a_policy_without_actions_leaves_a_line_and_no_row(tmp_path, capsys):
 
 def test_a_runs_folder_is_no_place_for_the_rows_of_another_policy(run):
     with pytest.raises(UsageError, match="output"):
-        own("mine.py:make", run.path, "representations=[seg]")
+        own("examples/own_policy.py:make", run.path, "representations=[seg]")

@@ -23,7 +23,7 @@ import imageio.v3 as imageio
 from flowrep.config import CONF_DIR, UsageError, group_choices
 from flowrep.config.schema import FactorizeConfig, validated
 from flowrep.factorize import factorize_recording, main
-from flowrep.sequences import Frame, SequenceError, read_flow, recorded_motion
+from flowrep.sequences import Frame, SequenceError, open_recording, read_flow, recorded_motion
 from flowrep.sequences.declared import declaration
 from flowrep.sequences.job import Job
 from flowrep.sequences.output import Output
@@ -96,7 +96,7 @@ def test_all_that_is_written(moments, tmp_path):
         assert float(row["raw_median_px_per_s"]) == pytest.approx(10 * float(row["raw_median_px"]))
     lines = np.loadtxt(out / "trajectory.txt")
     np.testing.assert_allclose(lines[:, 0], [0.0, 0.1, 0.2])
-    for line, moment in zip(lines, moments):
+    for line, moment in zip(lines, moments, strict=True):
         np.testing.assert_allclose(line[1:4], moment.world_from_cam[:3, 3], atol=1e-6)
         expected = synthetic.quaternion_line(moment.world_from_cam).split()
         np.testing.assert_allclose(line[4:], [float(x) for x in expected[3:]], atol=1e-6)
@@ -193,7 +193,7 @@ def test_what_cannot_be_factorised_is_named_and_leaves_nothing(moments, tmp_path
 def test_an_estimated_trajectory_begins_with_the_recorded_pose(moments, tmp_path):
     options = ["poses=estimated", "video=false", "flow_files=[]"]
     _, out = factorize(tmp_path, "flow=exact", *options)
-    for line, moment in zip(np.loadtxt(out / "trajectory.txt"), moments):
+    for line, moment in zip(np.loadtxt(out / "trajectory.txt"), moments, strict=True):
         np.testing.assert_allclose(line[1:4], moment.world_from_cam[:3, 3], atol=2e-3)
 
 
@@ -335,15 +335,18 @@ def run(monkeypatch, *arguments) -> int:
     return ended.value.code
 
 
-@pytest.mark.parametrize("format", ["frames", "tum", "sevenscenes", "replica", "kitti"])
-def test_a_wrong_folder_is_told_what_was_expected(format, tmp_path, monkeypatch, capsys):
-    (tmp_path / "in").mkdir()
-    given = [f"format={format}", f"input={tmp_path / 'in'}", f"output={tmp_path / 'out'}"]
-    assert run(monkeypatch, *given) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    expected = {"frames": "depth/*, ", "tum": "depth.txt", "sevenscenes": "*.pose.txt"}
-    assert expected.get(format, {"replica": "traj.txt", "kitti": "image_2"}.get(format)) in line
-    assert "Errno" not in line
+EXPECTED = {
+    "frames": "depth/*, ", "tum": "depth.txt", "sevenscenes": "*.pose.txt", "replica": "traj.txt",
+    "kitti": "image_2",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("format", EXPECTED)
+def test_a_wrong_folder_is_told_what_was_expected(format, tmp_path):
+    with pytest.raises(SequenceError) as refused:
+        open_recording(tmp_path, format)
+    assert EXPECTED[format] in str(refused.value)
+    assert "Errno" not in str(refused.value)
 
 
 def test_a_format_of_ones_own_says_what_is_different(moments, tmp_path, monkeypatch):

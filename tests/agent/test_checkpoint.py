@@ -1,7 +1,5 @@
 import os
 import pickle
-import resource
-import signal
 
 import pytest
 import torch
@@ -9,6 +7,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from flowrep.agent import CheckpointError, checkpoint, load_checkpoint, save_checkpoint
+from tests.viz.test_video import full_after
 
 
 def same(a, b):
@@ -125,15 +124,8 @@ def test_a_checkpoint_replaced_while_it_is_read_is_read_to_its_end(tmp_path, mon
 def test_a_full_disk_leaves_the_last_checkpoint(tmp_path):
     path = tmp_path / "c.safetensors"
     save_checkpoint(path, {"a": 1})
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
-        with pytest.raises(CheckpointError, match=r"c\.safetensors"):
-            save_checkpoint(path, {"a": torch.ones(10_000)})
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        signal.signal(signal.SIGXFSZ, handler)
+    with full_after(20_000), pytest.raises(CheckpointError, match=r"c\.safetensors"):
+        save_checkpoint(path, {"a": torch.ones(10_000)})
     assert load_checkpoint(path) == {"a": 1}
     assert os.listdir(tmp_path) == ["c.safetensors"]
 

@@ -180,9 +180,13 @@ SLIPS = {
 }
 
 
+OTHERS = ["preset", "experiment", "representations", ""]
+
+
 @pytest.mark.slow_after_first
-@pytest.mark.parametrize("slip", SLIPS)
-@pytest.mark.parametrize("group", ["scene", "preset", "experiment", "representations", ""])
+@pytest.mark.parametrize(
+    ("group", "slip"), [*(("scene", slip) for slip in SLIPS), *((g, "a tab") for g in OTHERS)]
+)
 def test_a_slip_in_a_file_of_ones_own_names_file_and_line(run, tmp_path, group, slip):
     text, number = SLIPS[slip]
     file = tmp_path / "conf" / group / "mine.yaml"

@@ -9,9 +9,6 @@ from flowrep.scenes import SceneError, load_scene
 from flowrep.scenes.load import json_schema
 
 CROSSROADS = Path(__file__).parent / "crossroads.yaml"
-DOUBLED = "a0: &a0 [x, x]\n" + "".join(
-    f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" for i in range(1, 60)
-)
 SCHEMA = Path(__file__).parents[2] / "docs" / "scene.schema.json"
 
 
@@ -32,12 +29,6 @@ def test_the_planner_drives_a_scene_it_was_not_made_for(drive):
     ("content", "named"),
     [
         (b"name: a\nroads: [1\n", ", line 3: "),
-        (b"name: 2001-99-99", ": "),
-        (b"name: \xff\xfe", ": "),
-        (b"name: a\nname: b", ", line 2: the key 'name'"),
-        (DOUBLED.encode(), ", line 16: "),  # 2 ** 17 - 1 values and lists
-        (b"name: &a {b: *a}", ", line 1: "),
-        (b"name: " + b"[" * 2000, ": "),
         (b"- a\n- b", ""),
         (b"", ""),
         (CROSSROADS.read_bytes().replace(b"layout_seed", b"layout_sed"), "layout_sed: "),

@@ -129,7 +129,7 @@ def test_a_leg_swings_back_while_the_other_swings_forward_and_the_body_only_turn
 def test_quaternions_are_the_matrices():
     poses = np.array([*POSE, [1.0, -3.0, -2.0, -0.3]])
     transforms = world_from_parts(poses)
-    for (x, y, z, w), transform in zip(quaternions_of_parts(poses), transforms):
+    for (x, y, z, w), transform in zip(quaternions_of_parts(poses), transforms, strict=True):
         # Of a unit quaternion's matrix, the columns for x and z.
         first = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
         third = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]

@@ -122,19 +122,26 @@ def write_frames(folder: Path) -> list[Moment]:
     return moments
 
 
-def write_tum(folder: Path) -> list[Moment]:
-    moments = make_moments(unit_m=1 / 5000)
+def write_tum(
+    folder: Path, unit_m=1 / 5000, depth_late_s=0.012, pose_late_s=-0.004
+) -> list[Moment]:
+    moments = make_moments(unit_m=unit_m)
     index: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
     for i, moment in enumerate(moments):
-        rgb_s, depth_s, pose_s = 100 + 0.1 * i, 100 + 0.1 * i + 0.012, 100 + 0.1 * i - 0.004
+        rgb_s = 100 + 0.1 * i
+        depth_s, pose_s = rgb_s + depth_late_s, rgb_s + pose_late_s
         put(folder / f"rgb/{rgb_s:.6f}.png", moment.rgb)
-        put(folder / f"depth/{depth_s:.6f}.png", stored(moment.depth, 1 / 5000))
+        put(folder / f"depth/{depth_s:.6f}.png", stored(moment.depth, unit_m))
         index["rgb"].append(f"{rgb_s:.6f} rgb/{rgb_s:.6f}.png")
         index["depth"].append(f"{depth_s:.6f} depth/{depth_s:.6f}.png")
         index["groundtruth"].append(f"{pose_s:.6f} {quaternion_line(moment.world_from_cam)}")
     for name, lines in index.items():
         put(folder / f"{name}.txt", ["# a comment", *lines])
     return moments
+
+
+def write_realsense(folder: Path) -> list[Moment]:
+    return write_tum(folder, unit_m=0.001, depth_late_s=0.0, pose_late_s=0.0)
 
 
 OPENCV_INTRINSICS = (31.0, 27.0, 18.0, 12.5)  # K, with pixel (0, 0)'s centre at (0, 0)
@@ -279,3 +286,82 @@ def write_kitti(folder: Path) -> list[Moment]:
     nothing = np.zeros_like(obj)
     later = Moment(rgb[1], np.full_like(depth, np.nan), poses[1], nothing, nothing)
     return [later, Moment(rgb[0], depth, poses[0], raw_flow, obj)]
+
+
+OPENCV_K = K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+FLIPPED_Y = np.diag([1.0, -1.0, 1.0, 1.0])
+
+
+def write_tartanair_v2(folder: Path) -> list[Moment]:
+    moments = make_moments(unit_m=1e-6, K=TARTANAIR_K)
+    for i, moment in enumerate(moments):
+        put(folder / f"image_lcam_front/{i:06d}_lcam_front.png", moment.rgb)
+        # The four bytes of a float, in the order in which OpenCV writes blue, green, red, alpha.
+        coded = cv2.imencode(".png", moment.depth.view(np.uint8).reshape(HEIGHT, WIDTH, 4))[1]
+        put(folder / f"depth_lcam_front/{i:06d}_lcam_front_depth.png", coded.tobytes())
+    poses = [moment.world_from_cam @ NED_FROM_OPENCV.T for moment in moments]
+    put(folder / "pose_lcam_front.txt", map(quaternion_line, poses))
+    return moments
+
+
+def write_icl_nuim(folder: Path) -> list[Moment]:
+    # Pictures begin with 0, poses with 1. Camera and world are left-handed, with y up.
+    moments = make_moments(unit_m=1 / 5000)
+    for i, moment in enumerate(moments, 9):
+        put(folder / f"rgb/{i}.png", moment.rgb)
+        put(folder / f"depth/{i}.png", stored(moment.depth, 1 / 5000))
+    poses = [FLIPPED_Y @ moment.world_from_cam @ FLIPPED_Y for moment in moments]
+    lines = [f"{i} {quaternion_line(pose)}" for i, pose in enumerate(poses, 9)]
+    put(folder / "livingRoom2.gt.freiburg", lines[1:])
+    return moments[1:]
+
+
+def write_replica(folder: Path) -> list[Moment]:
+    moments = make_moments(unit_m=1 / 6553.5)
+    for i, moment in enumerate(moments):
+        put(folder / f"results/frame{i:06d}.png", moment.rgb)
+        put(folder / f"results/depth{i:06d}.png", stored(moment.depth, 1 / 6553.5))
+    put(folder / "traj.txt", [numbers(moment.world_from_cam) for moment in moments])
+    return moments
+
+
+def write_scannet(folder: Path) -> list[Moment]:
+    moments = make_moments(unit_m=0.001)
+    lost = np.full((4, 4), -np.inf)
+    for i, moment in enumerate(moments):
+        put(folder / f"color/{i}.png", moment.rgb)
+        put(folder / f"depth/{i}.png", stored(moment.depth, 0.001))
+        put(folder / f"pose/{i}.txt", map(numbers, lost if i == 2 else moment.world_from_cam))
+    camera = np.eye(4)
+    camera[:3, :3] = OPENCV_K
+    for kind in ("color", "depth"):
+        put(folder / f"intrinsic/intrinsic_{kind}.txt", map(numbers, camera))
+    return moments[:2]
+
+
+KUBRIC_K = np.array([[30.0, 0.0, 20.0], [0.0, 30.0, 12.0], [0.0, 0.0, 1.0]])
+
+
+def write_kubric(folder: Path) -> list[Moment]:
+    moments = make_moments(unit_m=1e-6, K=KUBRIC_K)
+    row, column = np.indices((HEIGHT, WIDTH)) + 0.5
+    ray = np.sqrt(1 + ((column - 20) / 30) ** 2 + ((row - 12) / 30) ** 2)
+    backward = [-moment.raw[::-1] for moment in moments]  # to the frame before, rows first
+    least, most = float(np.min(backward)), float(np.max(backward))
+    for i, moment in enumerate(moments):
+        put(folder / f"rgba_{i:05d}.png", moment.rgb)
+        tiff = cv2.imencode(".tiff", (moment.depth * ray).astype(np.float32))[1]
+        put(folder / f"depth_{i:05d}.tiff", tiff.tobytes())
+        coded = np.rint((backward[i] - least) * 65535 / (most - least)).astype(np.uint16)
+        flow = np.stack([*coded, np.zeros_like(coded[0])], -1)
+        put(folder / f"backward_flow_{i:05d}.png", flow)
+    put(folder / "data_ranges.json", [json.dumps({"backward_flow": {"min": least, "max": most}})])
+    camera = {"positions": [], "quaternions": []}
+    camera["K"] = [[30 / WIDTH, 0, -0.5], [0, -30 / HEIGHT, -0.5], [0, 0, -1]]
+    for moment in moments:
+        blender = moment.world_from_cam @ np.diag([1.0, -1.0, -1.0, 1.0])
+        *position, x, y, z, w = map(float, quaternion_line(blender).split())
+        camera["positions"].append(position)
+        camera["quaternions"].append([w, x, y, z])
+    put(folder / "metadata.json", [json.dumps({"camera": camera})])
+    return moments

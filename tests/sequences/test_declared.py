@@ -218,7 +218,8 @@ LAYOUTS = {"xyz_xyzw": [0, 1, 2, 3, 4, 5, 6], "xyz_wxyz": [0, 1, 2, 6, 3, 4, 5]}
 def test_layouts_of_a_quaternion(layout, moments, tmp_path):
     rows = [np.array(quaternion_line(m.world_from_cam).split())[LAYOUTS[layout]] for m in moments]
     put(tmp_path / "poses.txt", [" ".join(row) for row in rows])
-    for frame, moment in zip(open_frames(tmp_path, pose_layout=layout), moments):
+    recording = open_frames(tmp_path, pose_layout=layout)
+    for frame, moment in zip(recording, moments, strict=True):
         np.testing.assert_allclose(frame.world_from_cam, moment.world_from_cam, atol=1e-12)
 
 
@@ -242,9 +243,9 @@ def test_left_handed_poses_give_the_same_motion(axes, direction, moments, tmp_pa
     for frame in recording:  # the world is mirrored, too
         assert np.linalg.det(frame.world_from_cam) == pytest.approx(1)
     truth = iter(moments[1:])
-    for made in [*factorize_frames(recording, lambda a, b: next(truth).raw)][1:]:
-        expected = moments[int(made.frame.name)].obj
-        assert np.abs(made.obj - expected).max() < 2e-4
+    _, *pairs = factorize_frames(recording, lambda a, b: next(truth).raw)
+    for made, moment in zip(pairs, moments[1:], strict=True):
+        assert np.abs(made.obj - moment.obj).max() < 2e-4
 
 
 def test_a_negative_fy_is_refused_with_the_mirror(tmp_path):

@@ -53,7 +53,7 @@ def test_streets_that_share_a_client_keep_their_exits_and_people_apart():
     alone = [[env.step(i)[0] for i in range(3)] for env in map(street, paths)]
     envs = [street(path) for path in paths]
     shared = zip(*[[env.step(i)[0] for env in envs] for i in range(3)])
-    for one, other in zip(alone, shared):
+    for one, other in zip(alone, shared, strict=True):
         np.testing.assert_equal(list(one), list(other))
 
 
