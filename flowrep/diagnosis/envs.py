@@ -9,18 +9,18 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.nn import functional
 
 from flowrep import geometry
-from flowrep.diagnosis.fit import EYE, median, px_of, sampled
-from flowrep.diagnosis.recordings import nothing, why_not
+from flowrep.diagnosis.fit import EYE, best_motion, median, px_of, residual, sampled, seen_before
+from flowrep.diagnosis.recordings import STANDS, nothing, why_not
 from flowrep.diagnosis.rivals import rivals_of
-from flowrep.diagnosis.verdict import Diagnosis, diagnosed
+from flowrep.diagnosis.verdict import INTERPOLATED_PX, Diagnosis, diagnosed, is_better
 
 _PAIRS = 8
-_MOVED_PX, _FEW_PIXELS = 0.25, 16  # bodies that show
+_BODIES, _MOVED_PX, _FEW_PIXELS = 24, 0.25, 32  # in pairs of frames, that show
+_ROUND = 0.05  # of a body's flow: depth between pixels is less exact where bodies are round
 _SAME_PX, _SAME_SHARE = 0.02, 0.01  # of flow that was computed twice
-_SAME_DEPTH = 0.03  # relative
-_ONE_SEES, _BETTER = 0.3, 0.03  # shares of bodies' pixels: the least, and a lead that tells
 
 
 @torch.no_grad()
@@ -74,15 +74,17 @@ def diagnose(
     maps = (static, seen.before, seen.K, seen.prev_K, torch.stack(path, 1), picture)
     pairs = sampled(raw, *maps)
     reasons = why_not(pairs)
+    names = [str(index) for index in kept.tolist()]
     able = torch.tensor([i for i, why in enumerate(reasons) if not why], dtype=torch.long)
     if not len(able):
         return nothing(reasons)
     able = able[_spread(len(able), _PAIRS)]
     rivals = rivals_of({}, by_flow=is_measured, of_flow=is_measured, absolute=is_absolute)
-    names = [str(index) for index in kept[able].tolist()]
-    result = diagnosed(pairs.of(able), [], rivals, names, _call)
+    stand = [name for name, why in zip(names, reasons) if why == STANDS]
+    named = [names[i] for i in able.tolist()]
+    result = diagnosed(pairs.of(able), [], rivals, named, _call, stand)
     faults, odd = _recomputed(seen, ego_key, obj_key)
-    fault, untested, doubt = _bodies(seen, pairs.depth_step)
+    fault, untested, doubt = ([], [], []) if result.is_wrong else _bodies(seen, pairs.depth_step)
     result = replace(result, notes=(*result.notes, *odd, *untested))
     if faults := [*faults, *fault]:
         words = "; ".join([result.words, *faults] if result.is_wrong else faults)
@@ -192,7 +194,11 @@ def _recomputed(seen: _Seen, ego_key: str, obj_key: str) -> tuple[list[str], lis
 
 
 def _bodies(seen: _Seen, depth_step: float) -> tuple[list[str], list[str], list[str]]:
-    """Returns what is wrong with ids and motions of bodies, what isn't tested, what is in doubt."""
+    """Returns what is wrong with ids and motions of bodies, what isn't tested, what is in doubt.
+
+    Each body of each frame is judged as the camera is: by what its motion leaves of the depth of
+    the frame before, on the body's pixels, and by what the best motion would leave there.
+    """
     count, ids = seen.rows.shape[1], seen.ids[:, 0]
     if int(ids.min()) < 0 or int(ids.max()) >= count:
         given = f"{int(ids.min())} to {int(ids.max())}"
@@ -202,29 +208,38 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[list[str], list[str], list[
     if moving and not (ids > 0).any():
         doubt = f"bodies {moving[0]} to {moving[-1]} move, but no pixel of instance has their ids"
         return [], [], [doubt]
-    shift = (seen.flow.flow - seen.ego.flow).norm(dim=1)
-    known = (seen.flow.valid & seen.ego.valid & seen.depth.isfinite())[:, 0]
-    of = ((ids > 0) & known & (shift > _MOVED_PX)).nonzero()
-    if len(of) < _FEW_PIXELS:
-        return [], ["no moving body is seen: ids and motions of bodies are not tested"], []
-    frame, body, z = of[:, 0], ids[*of.T], seen.depth[:, 0][*of.T]
-    points = geometry.unproject(seen.depth, seen.K)[*of.T].unsqueeze(-1)
-    rows, size = seen.rows[frame, body], torch.tensor(seen.before.shape[:0:-1])
-    tries = {"as recorded": rows, "inverted": geometry.invert_rigid(rows)}
-    tries["if they stand still"], shares = seen.motion[frame], {}
-    for says, motions in tries.items():  # shares of pixels that show a body, and are right then
-        then = (motions[:, :3, :3] @ points).squeeze(-1) + motions[:, :3, 3]
-        pixel = seen.prev_K[frame] @ (then / then[:, 2:].clamp(1e-6)).unsqueeze(-1)
-        pixel = pixel[:, :2, 0].nan_to_num(-1.0).long().minimum(size - 1).clamp(min=0)
-        at = (frame, pixel[:, 1], pixel[:, 0])
-        fits = (then[:, 2] / seen.before[at] - 1).abs() < _SAME_DEPTH + 1.5 * depth_step / z
-        shares[says] = float((fits & (seen.ids_before[:, 0][at] == body)).double().mean())
-    share = shares["as recorded"]
-    if share >= _ONE_SEES and max(shares.values()) <= share + _BETTER:
-        return [], [], []
-    listing = ", ".join(f"{part:.0%} {says}" for says, part in shares.items())
-    says = "instance_motion or ids don't fit the bodies: pixels that were where these say"
-    return [f"{says}: {listing}"], [], []
+    known = torch.where(seen.depth[:, 0].isfinite() & (ids > 0), ids, 0)
+    sizes = functional.one_hot(known.flatten(1), count).sum(1)
+    body, frame = (sizes.T[1:] >= _FEW_PIXELS).nonzero().T
+    unseen = ["no moving body is seen: ids and motions of bodies are not tested"]
+    if not len(body):
+        return [], unseen, []
+    chosen = _spread(len(frame), _BODIES)
+    frame, body = frame[chosen], body[chosen] + 1
+    of_body = body[:, None, None]
+    depth = torch.where(known[frame] == of_body, seen.depth[frame, 0], math.nan)
+    before = torch.where(seen.ids_before[frame, 0] == of_body, seen.before[frame], math.inf)
+    first = EYE.expand(len(frame), 4, 4)
+    path = torch.stack([first, first, seen.rows[frame, body], first], 1)
+    pairs = sampled(None, depth, before, seen.K[frame], seen.prev_K[frame], path)
+    pairs = pairs._replace(depth_step=depth_step, coarseness=depth_step / pairs.depth)
+    still = seen.motion[frame]
+    at, at_rest = (seen_before(pairs, motion)[0] for motion in (pairs.motion, still))
+    moved_px, left = px_of(at - at_rest), px_of(residual(pairs, pairs.motion), 0.5)
+    tells = torch.maximum(moved_px, left).nan_to_num(0.0) >= _MOVED_PX
+    if not tells.any():
+        return [], unseen, []
+    pairs, left, moved_px, body = pairs.of(tells), left[tells], moved_px[tells], body[tells]
+    best = px_of(residual(pairs, best_motion(pairs, pairs.motion, still[tells])), 0.5)
+    least = INTERPOLATED_PX + _ROUND * moved_px
+    for says, of in (
+        ("the bodies", body > 0), *((f"body {i}", body == i) for i in body.unique().tolist())
+    ):  # fmt: skip
+        if median(left[of] - least[of]) > 0 and is_better(best[of], left[of]):
+            size = f"{median(left[of]):.2g} px are left of {median(moved_px[of]):.2g} px"
+            why = f"instance_motion or ids don't fit {says}: {size}"
+            return [f"{why}, and a motion exists that would leave {median(best[of]):.2g} px"], [], []
+    return [], [], []
 
 
 def _call(typed: str, corrected: Any) -> str:

@@ -11,11 +11,22 @@ import torch
 from torch import Tensor
 
 from flowrep import geometry
-from flowrep.diagnosis.fit import EYE, Pairs, px_of, sampled, seen_before
+from flowrep.diagnosis.fit import (
+    EYE,
+    FITTED,
+    Pairs,
+    best_motion,
+    px_of,
+    residual,
+    sampled,
+    seen_before,
+)
 from flowrep.diagnosis.rivals import rivals_of
 from flowrep.diagnosis.verdict import Diagnosis, diagnosed
 
 _LEAST_PIXELS, _LEAST_MOVEMENT_PX = 64, 0.25  # pairs with less say nothing
+_CONTRADICTED = 3.0  # times what the best motion leaves
+STANDS = "the recorded motion stands still, depth doesn't"
 
 
 @dataclass
@@ -34,6 +45,7 @@ class Examination:
     _starts: list[Tensor] = field(default_factory=list)
     _names: list[str] = field(default_factory=list)
     _reasons: list[str] = field(default_factory=list)
+    _stand: list[str] = field(default_factory=list)
     _intervals_s: list[float] = field(default_factory=list)
 
     @torch.no_grad()
@@ -60,6 +72,7 @@ class Examination:
         (why,) = why_not(pairs)
         if why:
             self._reasons.append(why)
+            self._stand += [current.name] * (why == STANDS)
             return False
         options: Any = {"prev_K": prev_K.float(), "picture": picture}
         motion = geometry.camera_motion(flow, now[:, None], K.float(), **options).prev_from_curr
@@ -81,7 +94,8 @@ class Examination:
         pairs = pairs._replace(depth_step=max(part.depth_step for part in self._parts))
         options = {"by_flow": True, "of_flow": self.flow_is_recorded, "absolute": True}
         rivals = rivals_of(self.conventions, **options)
-        return diagnosed(pairs, [torch.cat(self._starts)], rivals, self._names, self._remedy)
+        starts = [torch.cat(self._starts)]
+        return diagnosed(pairs, starts, rivals, self._names, self._remedy, self._stand)
 
     def _remedy(self, typed: str, corrected: Pairs) -> str:
         words, given = typed.split(" "), self.conventions
@@ -102,18 +116,28 @@ class Examination:
 
 
 def why_not(pairs: Pairs) -> list[str]:
-    """Returns why each pair tells nothing, "" if it does."""
+    """Returns why each pair tells nothing, "" if it does, `STANDS` if its standstill is none."""
     ego = px_of(pairs.pixel - seen_before(pairs, pairs.motion)[0]).nan_to_num(0.0)
     moves = torch.maximum(px_of(pairs.raw).nan_to_num(0.0), ego) >= _LEAST_MOVEMENT_PX
     number, has_depth = (~pairs.depth.isnan()).sum(-1), pairs.now.isfinite().flatten(1).any(1)
+    tells = has_depth & (number >= _LEAST_PIXELS)
+    # A camera that stands still leaves depth as it is.
+    still, stands = (tells & ~moves).nonzero()[:, 0], torch.zeros_like(moves)
+    if len(still) and pairs.has_poses:
+        few = pairs.of(still, slice(FITTED))._replace(by_flow=False, scale_px=0.5)
+        first = EYE.expand(len(still), 4, 4)
+        left, best = (px_of(residual(few, x)) for x in (first, best_motion(few, first)))
+        stands[still] = (left >= _LEAST_MOVEMENT_PX) & (left > _CONTRADICTED * best)
     return [
         "depth is nowhere known" if not d else "too few pixels are known" if n < _LEAST_PIXELS else
-        "" if m else "hardly anything moves"
-        for d, n, m in zip(has_depth.tolist(), number.tolist(), moves.tolist())
+        "" if m else STANDS if s else "hardly anything moves"
+        for d, n, m, s in zip(*(x.tolist() for x in (has_depth, number, moves, stands)))
     ]  # fmt: skip
 
 
 def nothing(reasons: Sequence[str]) -> Diagnosis:
     """Returns the diagnosis without pairs that tell something."""
     why = max(reasons, key=reasons.count) if reasons else "there are no two successive frames"
+    if why == STANDS:
+        return Diagnosis("something is wrong", why)
     return Diagnosis("can't tell", f"{why}; record frames in which the camera moves and turns")

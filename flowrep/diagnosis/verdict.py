@@ -18,7 +18,7 @@ from flowrep.diagnosis.rivals import Rival
 # No error: rounding, a share of the noise, and of flow that was estimated, which is too short.
 _EXACT_PX, _OF_NOISE, _OF_ESTIMATED = 2e-3, 0.3, 0.03
 # Depth between pixels is exact on planes alone: round bodies leave 0.02 px of right data.
-_INTERPOLATED_PX = 0.04
+INTERPOLATED_PX = 0.04
 # What explains an error leaves several times less, or clearly less in most of many pairs.
 _SEVERAL, _CLEARLY, _MANY_PAIRS = 3.0, 1.7, 8
 _STRUCTURED = 0.1  # of raw flow: more structure than an estimator's own
@@ -31,7 +31,7 @@ _UNSURE = 0.15  # right data would be right to that alone
 _DOUBTFUL, _DOUBTFUL_PX = 0.15, 0.15  # left by the best motion: the flow's estimator failed
 # Pairs that don't fit the others err by these times the median, and this share of their flow; as
 # this share of all pairs they are a mistake in a part of the recording.
-_STRAY, _STRAY_SHARE, _MANY_STRAYS = 4.0, 0.1, 0.25
+_STRAY, _STRAY_SHARE, _MANY_STRAYS = 4.0, 0.1, 0.2
 _FARTHEST = 0.03  # a share of pixels at exactly the largest depth that means something
 _LARGEST_FACTORS = {"camera": 30.0, "depth": 1e5}
 
@@ -92,7 +92,7 @@ class Diagnosis:
 
 def diagnosed(
     pairs: Pairs, starts: Sequence[Tensor], rivals: Sequence[Rival], names: Sequence[str],
-    remedy: Callable[[str, Pairs], str],
+    remedy: Callable[[str, Pairs], str], stand: Sequence[str] = (),
 ) -> Diagnosis:  # fmt: skip
     """Returns the verdict on pairs that move.
 
@@ -100,6 +100,7 @@ def diagnosed(
         starts: motions `[P, 4, 4]` that the best one may be near to.
         names: the frames'.
         remedy: makes what the user types of `Rival.typed` and the pairs as they are then.
+        stand: the names of further frames, whose recorded standstill the data contradict.
     """
     recorded, others = _explanations(pairs, starts, rivals)
     width, motion = pairs.now.shape[-1], pairs.motion if pairs.has_poses else recorded.motion
@@ -140,8 +141,9 @@ def diagnosed(
         return Diagnosis("something is wrong", why, **numbers)
     most = (_STRAY_SHARE * flow_px).clamp(min=_STRAY * max(median(recorded.error), least))
     stray = [name for name, is_off in zip(names, (recorded.error > most).tolist()) if is_off]
-    if len(stray) > max(2, _MANY_STRAYS * len(names)):
-        why = f"poses of {len(stray)} in {len(names)} pairs don't fit: {', '.join(stray)}"
+    stray, count = [*stray, *stand], len(names) + len(stand)
+    if len(stray) > max(2, _MANY_STRAYS * count):
+        why = f"poses of {len(stray)} in {count} pairs don't fit: {', '.join(stray)}"
         return Diagnosis("something is wrong", why, **numbers)
     if not pairs.by_flow:
         hidden = median(pairs.K[:, 0, 0] * px_of(pairs.coarseness.unsqueeze(1), 0.5))
@@ -198,7 +200,7 @@ class _Fit:
         """The error below which there is none."""
         pairs = self.pairs
         bias = _OF_ESTIMATED * median(px_of(pairs.raw)) if pairs.is_estimated else 0.0
-        return max(self.floor, bias, 0.0 if pairs.by_flow else _INTERPOLATED_PX)
+        return max(self.floor, bias, 0.0 if pairs.by_flow else INTERPOLATED_PX)
 
     @cached_property
     def floor(self) -> float:
@@ -222,14 +224,14 @@ class _Fit:
         if structure > least:
             is_large = structure > _STRUCTURED * median(px_of(self.pairs.raw))
             share = median(smooth) / max(median(self.spread), 1e-12)
-            if share < 1 / _SEVERAL or (is_large and _is_better(smooth, self.spread)):
+            if share < 1 / _SEVERAL or (is_large and is_better(smooth, self.spread)):
                 return True
         if len(smooth) < _MANY_PAIRS or not median(self.error) > least:
             return False
-        return _is_better(_mapped(self.pairs, self.motion), self.error)
+        return is_better(_mapped(self.pairs, self.motion), self.error)
 
 
-def _is_better(after: Tensor, before: Tensor) -> bool:
+def is_better(after: Tensor, before: Tensor) -> bool:
     """Whether errors `[P]` are several times less than others, or clearly less in most pairs."""
     share = median(after) / max(median(before), 1e-12)
     better = int((after < before / 1.1).sum())
@@ -257,7 +259,7 @@ def _explanations(
 
     as_it_is = Rival("poses", "", "", lambda pairs, n: pairs)
     recorded, others = fitted(as_it_is, none, pairs, best_motion(pairs, *starts, steps=8)), []
-    if has_poses and recorded.left < _EXACT_PX:
+    if has_poses and recorded.left < (_EXACT_PX if pairs.by_flow else INTERPOLATED_PX):
         return recorded, []
     left = median(px_of(residual(few, pairs.motion if has_poses else recorded.motion)))
     for rival in rivals if has_poses else [rival for rival in rivals if rival.of != "poses"]:
@@ -319,7 +321,7 @@ def _able(others: Sequence[_Fit], before: Tensor, noise: Tensor, raw_px: float) 
     error, ranked = median(before), sorted(others, key=lambda each: after[id(each)])
     most = min(error, _EXPLAINED * raw_px) if error > _LARGE * raw_px else error / _SEVERAL
     able = [each for each in ranked if after[id(each)] < most]
-    able = [each for each in able if _is_better(each.beyond(noise), before)]
+    able = [each for each in able if is_better(each.beyond(noise), before)]
     if not able:
         return []
     enough = min(_CLEARLY * after[id(able[0])] + able[0].floor, error / _CLEARLY)
@@ -340,7 +342,7 @@ def _other_times(recorded: _Fit, raw_px: float) -> str:
     # The flow's own noise is amplified where depth hardly tells motions apart, as on a floor. If
     # depth agrees with poses that flow agrees with, it is of one time.
     before = by_flow.minimum(by_poses.nan_to_num(math.inf))
-    if px < _UNSURE * raw_px or median(before) < _INTERPOLATED_PX or not _is_better(after, before):
+    if px < _UNSURE * raw_px or median(before) < INTERPOLATED_PX or not is_better(after, before):
         return ""
     return f"depth moves otherwise than flow, by {px:.2g} px of {raw_px:.2g} px: is it of one time?"
 
