@@ -12,10 +12,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from flowrep import geometry
-from flowrep.diagnosis.fit import EYE, best_motion, median, px_of, residual, sampled, seen_before
+from flowrep.diagnosis.fit import INTERPOLATED_PX, EYE, best_motion, median, px_of, residual, sampled, seen_before
 from flowrep.diagnosis.recordings import STANDS, nothing, why_not
 from flowrep.diagnosis.rivals import rivals_of
-from flowrep.diagnosis.verdict import INTERPOLATED_PX, Diagnosis, diagnosed, is_better
+from flowrep.diagnosis.verdict import Diagnosis, diagnosed, is_better
 
 _PAIRS = 8
 _BODIES, _MOVED_PX, _FEW_PIXELS = 24, 0.25, 32  # in pairs of frames, that show

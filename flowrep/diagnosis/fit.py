@@ -18,6 +18,8 @@ PIXELS, FITTED = 1000, 400  # of a pair, and of these, those that motions and nu
 _LEAST_TEXTURE = 0.25  # of a structure tensor's trace, 0 to 2
 _BEHIND_PX = 1e3  # left of a point that a motion puts behind the camera
 _STEP = 1e-6  # of numeric derivatives
+# Depth between pixels is exact on planes alone: round bodies leave 0.02 px of right data.
+INTERPOLATED_PX = 0.04
 _SETTLED = 0.01  # a step that is too small to matter, in scales of all pixels' root of squares
 
 
@@ -275,19 +277,24 @@ def best_motion(pairs: Pairs, *starts: Tensor, steps: int = 5) -> Tensor:
     few, motions = pairs.of(pixels=slice(FITTED)), [*starts]
     nothing, nobody = torch.zeros(1, 0).double(), torch.zeros(len(few.K), dtype=torch.long)
     # Edges of depth first tell the way, and then, being interpolated, don't count any more.
-    rounds = [few] if pairs.by_flow else [few, few._replace(scale_px=1e-3)]
+    rounds = [few] if pairs.by_flow else [few, few._replace(scale_px=INTERPOLATED_PX)]
     for end in starts:
         for each in rounds:
             end, _ = descended(each, end, lambda p, n: p, nothing, nobody, steps=steps)
         motions.append(end)
-    return least_costly(few, torch.stack(motions))
+    return least_costly(rounds[-1], torch.stack(motions))
 
 
 def least_costly(few: Pairs, motions: Tensor) -> Tensor:
     """Returns that of motions `[M, P, 4, 4]` with which most pixels of each pair agree."""
-    squared = residual(few, motions).square().sum(-2)
-    scale = torch.stack([scale_of(each, few) for each in squared]).amin(0).square().unsqueeze(-1)
-    agreement = (1 / (1 + squared / scale)).nan_to_num(0.0).mean(-1)
+    agree = agreement(few, motions)
     if not few.by_flow:  # no interpolated edge is a reason to leave the first
-        agreement[0] += 0.01
-    return motions[agreement.argmax(0), torch.arange(squared.shape[1])]
+        agree[0] += 0.02
+    return motions[agree.argmax(0), torch.arange(agree.shape[1])]
+
+
+def agreement(pairs: Pairs, motions: Tensor) -> Tensor:
+    """Returns the share `[M, P]` of each pair's pixels that agree with motions `[M, P, 4, 4]`."""
+    squared = residual(pairs, motions).square().sum(-2)
+    scale = torch.stack([scale_of(each, pairs) for each in squared]).amin(0).square().unsqueeze(-1)
+    return (1 / (1 + squared / scale)).nan_to_num(0.0).mean(-1)

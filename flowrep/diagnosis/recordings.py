@@ -17,15 +17,13 @@ from flowrep.diagnosis.fit import (
     Pairs,
     best_motion,
     px_of,
-    residual,
     sampled,
     seen_before,
 )
 from flowrep.diagnosis.rivals import rivals_of
-from flowrep.diagnosis.verdict import Diagnosis, diagnosed
+from flowrep.diagnosis.verdict import Diagnosis, diagnosed, fitted
 
 _LEAST_PIXELS, _LEAST_MOVEMENT_PX = 64, 0.25  # pairs with less say nothing
-_CONTRADICTED = 3.0  # times what the best motion leaves
 STANDS = "the recorded motion stands still, depth doesn't"
 
 
@@ -125,9 +123,8 @@ def why_not(pairs: Pairs) -> list[str]:
     still, stands = (tells & ~moves).nonzero()[:, 0], torch.zeros_like(moves)
     if len(still) and pairs.has_poses:
         few = pairs.of(still, slice(FITTED))._replace(by_flow=False, scale_px=0.5)
-        first = EYE.expand(len(still), 4, 4)
-        left, best = (px_of(residual(few, x)) for x in (first, best_motion(few, first)))
-        stands[still] = (left >= _LEAST_MOVEMENT_PX) & (left > _CONTRADICTED * best)
+        rest = fitted(few, best_motion(few, few.motion))
+        stands[still] = rest.shown > max(rest.least, _LEAST_MOVEMENT_PX)
     return [
         "depth is nowhere known" if not d else "too few pixels are known" if n < _LEAST_PIXELS else
         "" if m else STANDS if s else "hardly anything moves"

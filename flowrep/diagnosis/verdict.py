@@ -12,13 +12,11 @@ import torch
 from torch import Tensor
 
 from flowrep.diagnosis import fit
-from flowrep.diagnosis.fit import EYE, Pairs, apart, best_motion, median, px_of, residual
+from flowrep.diagnosis.fit import INTERPOLATED_PX, EYE, Pairs, apart, best_motion, median, px_of, residual
 from flowrep.diagnosis.rivals import Rival
 
 # No error: rounding, a share of the noise, and of flow that was estimated, which is too short.
 _EXACT_PX, _OF_NOISE, _OF_ESTIMATED = 2e-3, 0.3, 0.03
-# Depth between pixels is exact on planes alone: round bodies leave 0.02 px of right data.
-INTERPOLATED_PX = 0.04
 # What explains an error leaves several times less, or clearly less in most of many pairs.
 _SEVERAL, _CLEARLY, _MANY_PAIRS = 3.0, 1.7, 8
 _STRUCTURED = 0.1  # of raw flow: more structure than an estimator's own
@@ -108,7 +106,7 @@ def diagnosed(
     flow_px = px_of(pairs.raw if pairs.by_flow else ego)
     raw_px = median(flow_px)
     noise = torch.stack([e.spread for e in (recorded, *others)]).nan_to_num(math.inf).amin(0)
-    errors, least = recorded.beyond(noise), recorded.least
+    errors, least = recorded.beyond(noise, recorded.shown), recorded.least
     error, best_px = median(errors), median(px_of(residual(pairs, recorded.motion, plain=True)))
     able = _able(others, errors, noise, raw_px) if error > least else []
     texts = [each.rival.texts(each.n, width) for each in able]
@@ -139,10 +137,10 @@ def diagnosed(
         return Diagnosis("something is wrong", why, **numbers)
     if pairs.by_flow and (why := _other_times(recorded, raw_px)):
         return Diagnosis("something is wrong", why, **numbers)
-    most = (_STRAY_SHARE * flow_px).clamp(min=_STRAY * max(median(recorded.error), least))
-    stray = [name for name, is_off in zip(names, (recorded.error > most).tolist()) if is_off]
+    most = (_STRAY_SHARE * flow_px).clamp(min=_STRAY * max(median(recorded.shown), least))
+    stray = [name for name, is_off in zip(names, (recorded.shown > most).tolist()) if is_off]
     stray, count = [*stray, *stand], len(names) + len(stand)
-    if len(stray) > max(2, _MANY_STRAYS * count):
+    if len(stray) >= max(3, _MANY_STRAYS * count):
         why = f"poses of {len(stray)} in {count} pairs don't fit: {', '.join(stray)}"
         return Diagnosis("something is wrong", why, **numbers)
     if not pairs.by_flow:
@@ -186,9 +184,10 @@ class _Fit:
     error: Tensor
     spread: Tensor
 
-    def beyond(self, noise: Tensor) -> Tensor:
+    def beyond(self, noise: Tensor, error: Tensor | None = None) -> Tensor:
         """Returns what is left beyond noise."""
-        return (self.error.square() + (self.spread.square() - noise.square()).clamp(min=0)).sqrt()
+        error = self.error if error is None else error
+        return (error.square() + (self.spread.square() - noise.square()).clamp(min=0)).sqrt()
 
     @property
     def left(self) -> float:
@@ -204,17 +203,39 @@ class _Fit:
 
     @cached_property
     def floor(self) -> float:
-        """The error below which errors are alike, by how far two halves of the picture differ.
+        """The error below which errors are alike, by how far two halves of the picture differ."""
+        halves_px = _SEVERAL * median(apart(self.pairs, *self.halves[1])) / 2
+        return max(_EXACT_PX, halves_px, _OF_NOISE * median(self.spread))
 
-        The halves are every other block of it, since neighbouring pixels err alike.
+    @cached_property
+    def halves(self) -> tuple[list[Pairs], list[Tensor]]:
+        """The pairs with every other block of the picture, and with the others, and their motions.
+
+        Blocks, since neighbouring pixels err alike.
         """
         pairs, is_even = self.pairs, _blocks(self.pairs, 6, 4)
         halves = [
-            best_motion(pairs._replace(depth=pairs.depth.masked_fill(half, math.nan)), self.motion)
+            pairs._replace(depth=pairs.depth.masked_fill(half, math.nan))
             for half in (is_even, ~is_even)
         ]
-        halves_px = _SEVERAL * median(apart(pairs, *halves)) / 2
-        return max(_EXACT_PX, halves_px, _OF_NOISE * median(self.spread))
+        return halves, [best_motion(half, self.motion) for half in halves]
+
+    @cached_property
+    def shown(self) -> Tensor:
+        """Errors that are no noise: to pixels that it wasn't fitted to, the best motion is better.
+
+        Of all pairs if it is in most, else of those in which it is to both halves.
+        """
+        if not self.pairs.has_poses:
+            return self.error
+        known, others = self.halves
+        better = torch.stack([
+            fit.agreement(half, torch.stack([self.pairs.motion, motion])).diff(dim=0)[0] > 0
+            for half, motion in zip(known, others[::-1])
+        ])  # fmt: skip
+        count = better.numel()
+        by_no_chance = 2 * int(better.sum()) - count > 2 * count**0.5
+        return torch.where(better.all(0) | by_no_chance, self.error, 0.0)
 
     @property
     def is_unexplained(self) -> bool:
@@ -226,9 +247,9 @@ class _Fit:
             share = median(smooth) / max(median(self.spread), 1e-12)
             if share < 1 / _SEVERAL or (is_large and is_better(smooth, self.spread)):
                 return True
-        if len(smooth) < _MANY_PAIRS or not median(self.error) > least:
+        if len(smooth) < _MANY_PAIRS or not median(self.shown) > least:
             return False
-        return is_better(_mapped(self.pairs, self.motion), self.error)
+        return is_better(_mapped(self.pairs, self.motion), self.shown)
 
 
 def is_better(after: Tensor, before: Tensor) -> bool:
@@ -252,13 +273,7 @@ def _explanations(
         known = [pairs.motion, *known]
         starts = [pairs.motion, fit.least_costly(few, torch.stack(known)), *starts]
 
-    def fitted(rival: Rival, n: Tensor, changed: Pairs, motion: Tensor) -> _Fit:
-        error = apart(changed, changed.motion, motion) if has_poses else none.new_zeros(len(none))
-        n = n.nanmedian(0).values
-        return _Fit(rival, n, changed, motion, error, px_of(residual(changed, motion)))
-
-    as_it_is = Rival("poses", "", "", lambda pairs, n: pairs)
-    recorded, others = fitted(as_it_is, none, pairs, best_motion(pairs, *starts, steps=8)), []
+    recorded, others = fitted(pairs, best_motion(pairs, *starts, steps=8)), []
     if has_poses and recorded.left < (_EXACT_PX if pairs.by_flow else INTERPOLATED_PX):
         return recorded, []
     left = median(px_of(residual(few, pairs.motion if has_poses else recorded.motion)))
@@ -275,8 +290,18 @@ def _explanations(
             if not median(px_of(few_left)) <= left:
                 continue
             motion = best_motion(changed, changed.motion)
-        others.append(fitted(rival, n, changed, motion))
+        others.append(fitted(changed, motion, rival, n))
     return recorded, others
+
+
+def fitted(pairs: Pairs, motion: Tensor, rival: Rival | None = None, n: Tensor | None = None) -> _Fit:
+    """Returns what pairs leave by the best motion, of a rival with its numbers `[P, k]`."""
+    none = pairs.depth[:, :0]
+    error = apart(pairs, pairs.motion, motion) if pairs.has_poses else none.new_zeros(len(none))
+    rival = rival or Rival("poses", "", "", lambda pairs, n: pairs)
+    n = none if n is None else n
+    spread = px_of(residual(pairs, motion))
+    return _Fit(rival, n.nanmedian(0).values, pairs, motion, error, spread)
 
 
 def _learnt(few: Pairs, rival: Rival, best: Tensor) -> Tensor | None:
