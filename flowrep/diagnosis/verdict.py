@@ -296,8 +296,9 @@ def _explanations(
 
 def fitted(pairs: Pairs, motion: Tensor, rival: Rival | None = None, n: Tensor | None = None) -> _Fit:
     """Returns what pairs leave by the best motion, of a rival with its numbers `[P, k]`."""
-    none = pairs.depth[:, :0]
-    error = apart(pairs, pairs.motion, motion) if pairs.has_poses else none.new_zeros(len(none))
+    none, error = pairs.depth[:, :0], apart(pairs, pairs.motion, motion)
+    if not pairs.motion.isfinite().any():  # without poses, the best motion is as good as any
+        error = torch.zeros_like(error)
     rival = rival or Rival("poses", "", "", lambda pairs, n: pairs)
     n = none if n is None else n
     spread = px_of(residual(pairs, motion))
