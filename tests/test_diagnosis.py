@@ -186,7 +186,8 @@ def test_without_poses_flow_depth_and_K_are_judged_among_themselves():
 
 def test_what_hardly_moves_or_is_hardly_known_tells_nothing():
     taken = shots(3)
-    still = examined(taken.with_(flow=0 * taken.flow, poses=taken.poses[[0, 0, 0]]), {})
+    stands = taken.with_(flow=0 * taken.flow, poses=taken.poses[[0, 0, 0]])
+    still = examined(stands.with_(depth=taken.depth[[0, 0, 0]]), {})
     assert (still.verdict, still.pairs) == ("can't tell", 0)
     assert "moves" in still.words
     unknown = taken.depth.copy()

@@ -12,13 +12,23 @@ from torch import Tensor
 from torch.nn import functional
 
 from flowrep import geometry
-from flowrep.diagnosis.fit import INTERPOLATED_PX, EYE, best_motion, median, px_of, residual, sampled, seen_before
-from flowrep.diagnosis.recordings import STANDS, nothing, why_not
+from flowrep.diagnosis.fit import (
+    EYE,
+    INTERPOLATED_PX,
+    best_motion,
+    median,
+    px_of,
+    residual,
+    sampled,
+    seen_before,
+)
+from flowrep.diagnosis.recordings import STANDS, left_out, nothing, why_not
 from flowrep.diagnosis.rivals import rivals_of
 from flowrep.diagnosis.verdict import Diagnosis, diagnosed, is_better
 
 _PAIRS = 8
 _BODIES, _MOVED_PX, _FEW_PIXELS = 24, 0.25, 32  # in pairs of frames, that show
+_FEW_FRAMES = 3  # of a body
 _ROUND = 0.05  # of a body's flow: depth between pixels is less exact where bodies are round
 _SAME_PX, _SAME_SHARE = 0.02, 0.01  # of flow that was computed twice
 
@@ -85,6 +95,7 @@ def diagnose(
     result = diagnosed(pairs.of(able), [], rivals, named, _call, stand)
     faults, odd = _recomputed(seen, ego_key, obj_key)
     fault, untested, doubt = ([], [], []) if result.is_wrong else _bodies(seen, pairs.depth_step)
+    odd += left_out(reasons, sum(not why for why in reasons))
     result = replace(result, notes=(*result.notes, *odd, *untested))
     if faults := [*faults, *fault]:
         words = "; ".join([result.words, *faults] if result.is_wrong else faults)
@@ -218,7 +229,12 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[list[str], list[str], list[
     frame, body = frame[chosen], body[chosen] + 1
     of_body = body[:, None, None]
     depth = torch.where(known[frame] == of_body, seen.depth[frame, 0], math.nan)
-    before = torch.where(seen.ids_before[frame, 0] == of_body, seen.before[frame], math.inf)
+    before, nearest = seen.before[frame], depth.nan_to_num(math.inf).amin((1, 2), keepdim=True)
+    is_body = seen.ids_before[frame, 0] == of_body
+    # Between a body's edge and the next pixel nothing is known, nor where something hides it.
+    around = functional.max_pool2d(is_body.float(), 3, 1, 1) > 0
+    other = torch.where(around | (before < 0.9 * nearest), math.nan, math.inf)
+    before = torch.where(is_body, before, other)
     first = EYE.expand(len(frame), 4, 4)
     path = torch.stack([first, first, seen.rows[frame, body], first], 1)
     pairs = sampled(None, depth, before, seen.K[frame], seen.prev_K[frame], path)
@@ -226,8 +242,9 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[list[str], list[str], list[
     still = seen.motion[frame]
     at, at_rest = (seen_before(pairs, motion)[0] for motion in (pairs.motion, still))
     moved_px, left = px_of(at - at_rest), px_of(residual(pairs, pairs.motion), 0.5)
-    tells = torch.maximum(moved_px, left).nan_to_num(0.0) >= _MOVED_PX
-    if not tells.any():
+    number = residual(pairs, pairs.motion).isfinite().sum((1, 2))
+    tells = (torch.maximum(moved_px, left) >= _MOVED_PX) & (number >= _FEW_PIXELS)
+    if int(tells.sum()) < _FEW_FRAMES:
         return [], unseen, []
     pairs, left, moved_px, body = pairs.of(tells), left[tells], moved_px[tells], body[tells]
     best = px_of(residual(pairs, best_motion(pairs, pairs.motion, still[tells])), 0.5)
@@ -235,10 +252,15 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[list[str], list[str], list[
     for says, of in (
         ("the bodies", body > 0), *((f"body {i}", body == i) for i in body.unique().tolist())
     ):  # fmt: skip
-        if median(left[of] - least[of]) > 0 and is_better(best[of], left[of]):
+        is_off = int(of.sum()) >= _FEW_FRAMES and median(left[of] - least[of]) > 0
+        if is_off and is_better(best[of], left[of]):
             size = f"{median(left[of]):.2g} px are left of {median(moved_px[of]):.2g} px"
             why = f"instance_motion or ids don't fit {says}: {size}"
-            return [f"{why}, and a motion exists that would leave {median(best[of]):.2g} px"], [], []
+            return (
+                [f"{why}, and a motion exists that would leave {median(best[of]):.2g} px"],
+                [],
+                [],
+            )
     return [], [], []
 
 

@@ -288,8 +288,6 @@ def best_motion(pairs: Pairs, *starts: Tensor, steps: int = 5) -> Tensor:
 def least_costly(few: Pairs, motions: Tensor) -> Tensor:
     """Returns that of motions `[M, P, 4, 4]` with which most pixels of each pair agree."""
     agree = agreement(few, motions)
-    if not few.by_flow:  # no interpolated edge is a reason to leave the first
-        agree[0] += 0.02
     return motions[agree.argmax(0), torch.arange(agree.shape[1])]
 
 
@@ -297,4 +295,7 @@ def agreement(pairs: Pairs, motions: Tensor) -> Tensor:
     """Returns the share `[M, P]` of each pair's pixels that agree with motions `[M, P, 4, 4]`."""
     squared = residual(pairs, motions).square().sum(-2)
     scale = torch.stack([scale_of(each, pairs) for each in squared]).amin(0).square().unsqueeze(-1)
-    return (1 / (1 + squared / scale)).nan_to_num(0.0).mean(-1)
+    agree = (1 / (1 + squared / scale)).nan_to_num(0.0).mean(-1)
+    if not pairs.by_flow:  # no interpolated edge is a reason to leave the first
+        agree[0] += 0.02
+    return agree

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -24,6 +24,7 @@ from flowrep.diagnosis.rivals import rivals_of
 from flowrep.diagnosis.verdict import Diagnosis, diagnosed, fitted
 
 _LEAST_PIXELS, _LEAST_MOVEMENT_PX = 64, 0.25  # pairs with less say nothing
+_MANY_LEFT_OUT = 0.2
 STANDS = "the recorded motion stands still, depth doesn't"
 
 
@@ -93,7 +94,8 @@ class Examination:
         options = {"by_flow": True, "of_flow": self.flow_is_recorded, "absolute": True}
         rivals = rivals_of(self.conventions, **options)
         starts = [torch.cat(self._starts)]
-        return diagnosed(pairs, starts, rivals, self._names, self._remedy, self._stand)
+        found = diagnosed(pairs, starts, rivals, self._names, self._remedy, self._stand)
+        return replace(found, notes=(*found.notes, *left_out(self._reasons, len(self._names))))
 
     def _remedy(self, typed: str, corrected: Pairs) -> str:
         words, given = typed.split(" "), self.conventions
@@ -130,6 +132,15 @@ def why_not(pairs: Pairs) -> list[str]:
         "" if m else STANDS if s else "hardly anything moves"
         for d, n, m, s in zip(*(x.tolist() for x in (has_depth, number, moves, stands)))
     ]  # fmt: skip
+
+
+def left_out(reasons: Sequence[str], used: int) -> list[str]:
+    """Returns a note on pairs that tell nothing, if they are many; "" is no reason."""
+    reasons = [why for why in reasons if why not in ("", STANDS)]
+    count = len(reasons) + used
+    if len(reasons) < _MANY_LEFT_OUT * count:
+        return []
+    return [f"{len(reasons)} of {count} pairs are not tested: {max(reasons, key=reasons.count)}"]
 
 
 def nothing(reasons: Sequence[str]) -> Diagnosis:

@@ -12,7 +12,16 @@ import torch
 from torch import Tensor
 
 from flowrep.diagnosis import fit
-from flowrep.diagnosis.fit import INTERPOLATED_PX, EYE, Pairs, apart, best_motion, median, px_of, residual
+from flowrep.diagnosis.fit import (
+    EYE,
+    INTERPOLATED_PX,
+    Pairs,
+    apart,
+    best_motion,
+    median,
+    px_of,
+    residual,
+)
 from flowrep.diagnosis.rivals import Rival
 
 # No error: rounding, a share of the noise, and of flow that was estimated, which is too short.
@@ -23,13 +32,14 @@ _STRUCTURED = 0.1  # of raw flow: more structure than an estimator's own
 # Shares of raw flow. Noise of poses reaches `_ROUGH` and a number of pixels that grows with the
 # picture, unless the flow is nearly free of noise.
 _LARGE = 0.04  # errors that may be explained if something leaves clearly less, not several times
-_EXPLAINED = 0.25  # what an explanation leaves at most
+_EXPLAINED = 0.1  # what an explanation leaves at most
 _ROUGH, _ROUGH_WIDTHS, _TIMES_THE_NOISE, _LITTLE = 0.25, 1 / 1280, 20.0, 0.02
 _UNSURE = 0.15  # right data would be right to that alone
 _DOUBTFUL, _DOUBTFUL_PX = 0.15, 0.15  # left by the best motion: the flow's estimator failed
 # Pairs that don't fit the others err by these times the median, and this share of their flow; as
 # this share of all pairs they are a mistake in a part of the recording.
-_STRAY, _STRAY_SHARE, _MANY_STRAYS = 4.0, 0.1, 0.2
+_STRAY, _STRAY_SHARE, _MANY_STRAYS = 4.0, 0.04, 0.2
+_OFF, _OFF_PX, _OFF_SHARE = 3.0, 0.1, 0.03  # pixels that don't fit: in scales, and their share
 _FARTHEST = 0.03  # a share of pixels at exactly the largest depth that means something
 _LARGEST_FACTORS = {"camera": 30.0, "depth": 1e5}
 
@@ -158,6 +168,11 @@ def diagnosed(
     share = float((known == known.amax()).double().mean()) if len(known) else 0.0
     if share > _FARTHEST:
         notes.append(f"{share:.0%} of depth is {known.amax():.4g} m: if that is no surface, say so")
+    squared = residual(pairs, motion).square().sum(-2)
+    off = squared.sqrt() > (_OFF * fit.scale_of(squared, pairs)).clamp(min=_OFF_PX).unsqueeze(-1)
+    share = float(off.sum() / squared.isfinite().sum())
+    if pairs.by_flow and share > _OFF_SHARE:
+        notes.append(f"{share:.0%} of the pixels don't fit: they move, or depth is wrong there")
     if stray:
         notes.append(f"poses that don't fit the others: {', '.join(stray)}")
     if not pairs.has_poses:
@@ -294,10 +309,12 @@ def _explanations(
     return recorded, others
 
 
-def fitted(pairs: Pairs, motion: Tensor, rival: Rival | None = None, n: Tensor | None = None) -> _Fit:
+def fitted(
+    pairs: Pairs, motion: Tensor, rival: Rival | None = None, n: Tensor | None = None
+) -> _Fit:
     """Returns what pairs leave by the best motion, of a rival with its numbers `[P, k]`."""
     none, error = pairs.depth[:, :0], apart(pairs, pairs.motion, motion)
-    if not pairs.motion.isfinite().any():  # without poses, the best motion is as good as any
+    if not pairs.path[:, 1].isfinite().any():  # without poses, the best motion is as good as any
         error = torch.zeros_like(error)
     rival = rival or Rival("poses", "", "", lambda pairs, n: pairs)
     n = none if n is None else n

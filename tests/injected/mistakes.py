@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tests.injected.sources import Shots, euler, rigid
+from tests.injected.sources import CAMERA, Shots, euler, rigid
 
 Mistake = Callable[[Shots], Shots]
 
@@ -36,6 +36,47 @@ def of_camera(change: Callable[[np.ndarray, int, int], np.ndarray]) -> Mistake:
         return shots.with_(K=np.array([change(K.copy(), height, width) for K in shots.K]))
 
     return spoilt
+
+
+def of_bodies(change: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Mistake:
+    """Changes how bodies move in the world `[N, 4, 4]`, given the poses before and now too."""
+
+    def spoilt(shots: Shots) -> Shots:
+        moved = shots.moved.copy()
+        for t in range(1, len(moved)):
+            moved[t, 1:] = change(moved[t, 1:], shots.poses[t - 1 : t + 1])
+        return shots.with_(moved=moved)
+
+    return spoilt
+
+
+def halved(motion):
+    """Returns half of a rigid motion: twice in succession it is the whole."""
+    w, *xyz = quaternion(motion[:3, :3])
+    turn = rotation_of(*(np.array([w + np.copysign(1.0, w), *xyz]) / np.sqrt(2 + 2 * abs(w))))
+    return rigid(turn, np.linalg.solve(np.eye(3) + turn, motion[:3, 3]))
+
+
+def enlarged(depth, by: int = 4):
+    """Returns depth that was reduced and enlarged again, bilinearly."""
+    frames, height, width = depth.shape
+    small = np.nan_to_num(depth, posinf=1e3)[:, : height // by * by, : width // by * by]
+    small = small.reshape(frames, height // by, by, width // by, by).mean((2, 4))
+    v, u = (np.mgrid[:height, :width] + 0.5) / by
+    return np.array([bilinear(each[..., None], u, v)[..., 0] for each in small])
+
+
+def angles_in_another_order(poses):
+    for pose in poses:
+        m = pose[:3, :3] @ CAMERA.T  # Rz Ry Rx, read as Rx Ry Rz
+        roll, pitch, yaw = (
+            np.arctan2(m[2, 1], m[2, 2]),
+            -np.arcsin(m[2, 0]),
+            np.arctan2(m[1, 0], m[0, 0]),
+        )
+        x, y, z = euler(roll, 0, 0), euler(0, pitch, 0), euler(0, 0, yaw)
+        pose[:3, :3] = x @ y @ z @ CAMERA
+    return poses
 
 
 # Each column is the direction of one of the camera's axes among right, down and ahead.
@@ -287,6 +328,8 @@ UNLISTED: dict[str, Mistake] = {
     "rotations camera-to-world, translations not": of_poses(lambda p: np.concatenate([p[..., :3], inverted(p)[..., 3:]], -1)),
     "poses of another time": of_poses(lambda p: np.roll(p, 5, 0)),
     "poses' yaw times 1.2": of_poses(lambda p: np.array([rigid(euler(0, 0, 0.2 * np.arctan2(x[1, 2], x[0, 2])) @ x[:3, :3], x[:3, 3]) for x in p])),
+    "poses that freeze": of_poses(lambda p: np.concatenate([p[: len(p) * 2 // 5], np.repeat(p[None, len(p) * 2 // 5], len(p) - len(p) * 2 // 5, 0)])),
+    "poses by angles in another order": of_poses(angles_in_another_order),
     "fx and fy swapped": of_camera(lambda K, h, w: np.array([[K[1, 1], 0, K[0, 2]], [0, K[0, 0], K[1, 2]], [0, 0, 1]])),
     "fx 10 % off": of_camera(lambda K, h, w: K * np.array([[1.1, 1, 1], [1, 1, 1], [1, 1, 1]])),
     "cx 8 % off": of_camera(lambda K, h, w: moved_centre(K, 0.08 * w, 0.0)),
@@ -294,6 +337,14 @@ UNLISTED: dict[str, Mistake] = {
     "depth of later frames": of_depth(lambda z: np.roll(z, -5, 0)),
     "depth of another scale in each frame": of_depth(lambda z: z * np.exp(0.25 * np.random.default_rng(1).normal(size=(len(z), 1, 1)))),
     "depth in steps of 25 cm": of_depth(lambda z: np.maximum(np.round(z / 0.25) * 0.25, 0.25)),
+    "depth beyond 3 m wrapped": of_depth(lambda z: np.where(np.isinf(z), z, z % 3.0)),
+    "depth enlarged 4 times": of_depth(enlarged),
     "flow of a flipped picture": flipped,
     "flow shuffled": of_flow(lambda f: np.concatenate([f[:1], f[1:][np.random.default_rng(5).permutation(len(f) - 1)]])),
+    "bodies at rest": of_bodies(lambda m, _: np.tile(np.eye(4), (len(m), 1, 1))),
+    "bodies' motions halved": of_bodies(lambda m, _: np.array([halved(x) for x in m])),
+    "bodies' motions doubled": of_bodies(lambda m, _: m @ m),
+    "bodies' motions inverted": of_bodies(lambda m, _: inverted(m)),
+    "bodies' motions in the world": of_bodies(lambda m, p: p[0] @ m @ inverted(p[1])),
+    "bodies' motions off by a row": of_bodies(lambda m, _: np.roll(m, 1, 0)),
 }  # fmt: skip
