@@ -185,21 +185,24 @@ def realsense(seed: int = 0) -> Shots:
 
 
 @cache
-def street(seed: int = 0, frames: int = 14, size: tuple[int, int] = (120, 160)) -> Shots:
-    """Returns a drive of flowrep's planner through a turn among people."""
+def street(
+    seed: int = 0, frames: int = 14, size: tuple[int, int] = (120, 160), scene_name: str = "s_turn",
+    skipped: int = 40,
+) -> Shots:  # fmt: skip
+    """Returns a drive of flowrep's planner, by default through a turn among people."""
     from flowrep.baselines import Planner
     from flowrep.envs import StreetEnv
     from flowrep.envs.sensing import SENSORS
     from flowrep.scenes import load_scene
 
-    scene = load_scene("s_turn")
+    scene = load_scene(scene_name)
     camera = replace(scene.camera, height_px=size[0], width_px=size[1])
     env, planner = StreetEnv(replace(scene, camera=camera), sensors=SENSORS), Planner()
     names = ("depth", "rgb", "instance", "prev_from_curr", "instance_motion")
     maps: dict[str, list[Array]] = {name: [] for name in names}
     try:
         env.reset(seed=seed)
-        for _ in range(40):
+        for _ in range(skipped):
             env.drive(planner(env))
         for _ in range(frames):
             seen, *_ = env.step(planner(env))
