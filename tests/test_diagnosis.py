@@ -22,7 +22,7 @@ from flowrep import diagnose, geometry
 from flowrep.diagnosis import Examination
 from flowrep.geometry.pose import rotation_from_vector
 from tests.injected import matrix, mistakes
-from tests.injected.sources import ENVS, RECORDINGS, realsense, room, street, street
+from tests.injected.sources import ENVS, RECORDINGS, realsense, room, street
 
 
 def only(source, mistake):
@@ -198,43 +198,6 @@ def test_pixels_that_do_not_fit_are_told_with_their_share():
     assert abs(float(note.split("%")[0]) / 100 - wraps.mean()) < 0.05
 
 
-def test_poses_that_stand_still_for_a_part_are_noticed():
-    poses = room(3).poses.copy()
-    poses[12:] = poses[11]  # four of fifteen pairs
-    taken = room(3).with_(poses=poses)
-    flow = room(3).flow.copy()
-    flow[12:] = 0.0  # as if it was computed from these poses
-    assert "12, 13, 14, 15" in matrix.of_recording(taken.with_(rgb=None)).words
-    found = matrix.of_recording(taken.with_(flow=flow, rgb=None))
-    assert "12, 13, 14, 15" in found.words
-    assert "poses of" in matrix.of_env(taken).words
-    # Where the camera stands, depth stands too, and that is no mistake.
-    stands = taken.with_(
-        **{n: np.concatenate([getattr(room(3), n)[:12], getattr(room(3), n)[[11] * 4]])
-           for n in ("depth", "ids", "rgb", "moved")}, flow=flow,
-    )  # fmt: skip
-    for found in (matrix.of_recording(stands.with_(rgb=None)), matrix.of_env(stands)):
-        assert found.is_right
-        assert any("4 of 15 pairs are not tested" in note for note in found.notes)
-
-
-def test_poses_that_are_a_little_off_in_half_of_the_pairs_are_noticed():
-    poses = room(3).poses.copy()
-    for t in range(1, 16, 2):  # each second step is 8 % too long
-        poses[t:, :3, 3] += 0.08 * (room(3).poses[t, :3, 3] - room(3).poses[t - 1, :3, 3])
-    found = matrix.of_recording(room(3).with_(poses=poses, rgb=None))
-    assert found.is_wrong
-
-
-def test_pixels_that_do_not_fit_are_told_with_their_share():
-    depth = room(3).depth
-    wraps = depth > 3.0
-    found = matrix.of_recording(room(3).with_(depth=depth % 3.0, rgb=None))
-    assert 0.1 < wraps.mean() < 0.4
-    (note,) = [note for note in found.notes if "don't fit" in note]
-    assert abs(float(note.split("%")[0]) / 100 - wraps.mean()) < 0.05
-
-
 def test_an_identity_among_the_poses_is_named_by_its_frame_and_does_not_decide():
     poses = room(3).poses.copy()
     poses[7] = np.eye(4)
@@ -332,21 +295,6 @@ def test_motions_of_bodies_that_are_a_quarter_too_short_are_wrong():
     wrong = right.with_(moved=moved)
     assert 0.5 < matrix.bodies_px(right, wrong) < 2
     assert "instance_motion" in matrix.of_env(wrong).words
-
-
-def test_a_body_whose_motion_alone_is_wrong_is_named(frames):
-    found = spoilt(frames, instance_motion=lambda rows: torch.cat(
-        [rows[:, :2], rows[:, :1]], 1))  # fmt: skip
-    assert "body 2:" in found.words
-
-
-@pytest.mark.parametrize("name", [name for name in mistakes.UNLISTED if name[:6] == "bodies"])
-def test_motions_of_bodies_that_their_pixels_contradict_are_wrong(name):
-    right = room(3, movers=2)
-    assert matrix.bodies_px(right, mistakes.UNLISTED[name](right)) > 0.5
-    found = matrix.of_env(mistakes.UNLISTED[name](right))
-    assert found.is_wrong
-    assert "instance_motion" in found.words
 
 
 def test_a_body_whose_motion_alone_is_wrong_is_named(frames):
@@ -534,19 +482,6 @@ def test_noise_of_depth_is_no_mistake_of_the_poses():
     for _ in range(3):  # twice that of a Kinect, 12 cm at 5 m
         noise = 0.005 * depth**2 * random.normal(size=depth.shape)
         assert matrix.of_env(small.with_(depth=depth + noise)).is_right
-
-
-def test_a_straight_street_whose_depth_hardly_changes_is_right():
-    pytest.importorskip("pybullet", reason="the streets are PyBullet's")
-    straight = street(0, 30, (48, 48), "straight_road", 25)
-    assert matrix.of_env(straight).is_right
-
-
-def test_noise_of_depth_is_no_mistake_of_the_poses():
-    taken, random = room(3, movers=2), np.random.default_rng(0)
-    for share in (0.0012, 0.0025):  # of a Kinect's, some 1 to 6 cm at 5 m
-        noise = share * taken.depth**2 * random.normal(size=taken.depth.shape)
-        assert matrix.of_env(taken.with_(depth=taken.depth + noise)).is_right
 
 
 def test_a_straight_street_whose_depth_hardly_changes_is_right():
