@@ -32,7 +32,7 @@ _STRUCTURED = 0.1  # of raw flow: more structure than an estimator's own
 # Shares of raw flow. Noise of poses reaches `_ROUGH` and a number of pixels that grows with the
 # picture, unless the flow is nearly free of noise.
 _LARGE = 0.04  # errors that may be explained if something leaves clearly less, not several times
-_EXPLAINED = 0.1  # what an explanation leaves at most
+_EXPLAINED = 0.25  # what an explanation leaves at most
 _ROUGH, _ROUGH_WIDTHS, _TIMES_THE_NOISE, _LITTLE = 0.25, 1 / 1280, 20.0, 0.02
 _UNSURE = 0.15  # right data would be right to that alone
 _DOUBTFUL, _DOUBTFUL_PX = 0.15, 0.15  # left by the best motion: the flow's estimator failed
