@@ -150,7 +150,7 @@ def film(config: EvaluateConfig, agent: Agent, folder: RunFolder, stop: StopRequ
     """Writes `video` episodes for each speed and frame rate, until a stop is asked for."""
     from flowrep.experiment.film import record_episode
 
-    name = agent.config.scene["name"]
+    name = agent.config.scene.name
     where = "" if name == agent.trained_in else f"{name}_"
     for speed, rate, number in product(config.speed, config.fps, range(config.video)):
         if stop:

@@ -41,9 +41,6 @@ class EarlyCheck(Callback):
             model = checked(config, TrainConfig)
             if model.resume is not None:
                 return
-            from flowrep.scenes import load_scene
-
-            load_scene(model.scene)
             has_own_classes = {*model.trusted} - {*ALGORITHMS}
             if has_own_classes or model.device not in ("auto", "cpu"):
                 from flowrep.experiment import build
@@ -119,7 +116,7 @@ def announce(config: TrainConfig, preset: str) -> None:
     where = torch.cuda.get_device_name(device) if device.type == "cuda" else cpu_name()
     cores = f", {available_cores()} cores" if device.type == "cpu" else ""
     maps, algorithm = ",".join(config.representations), config.algorithm.target.rpartition(".")[2]
-    print(f"{algorithm} on [{maps}] in {config.scene['name']}, preset={preset}")
+    print(f"{algorithm} on [{maps}] in {config.scene.name}, preset={preset}")
     print(f"device: {device.type} ({where}{cores})")
     if preset == "paper" and device.type == "cpu" and config.total_frames >= 1_000_000:
         print(

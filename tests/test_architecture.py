@@ -18,21 +18,22 @@ FLOWREP_IMPORTS_ALLOWED = {
     "diagnosis": {"diagnosis", "geometry"},
     "agent": {"agent", "extras", "files", "options"},
     "files": set(),
-    "scenes": {"scenes", "config", "extras"},
+    "scenes": {"scenes", "yaml_file", "extras"},
     "simulator": {"simulator", "scenes", "extras"},
     "envs": {"envs", "simulator", "scenes", "transforms", "geometry", "extras"} | {"progress"},
     "pybullet": {"simulator", "extras"},
     "baselines": {"baselines", "envs", "scenes"},
     "experiment": {"experiment", "baselines", "envs", "simulator", "scenes", "agent"}
     | {"transforms", "geometry", "progress", "tables", "config", "extras", "viz"}
-    | {"files", "options"},
+    | {"files", "options", "yaml_file"},
     "progress": set(),
     "tables": {"files"},
     "viz": {"viz", "scenes", "geometry"},
     "sequences": {"sequences", "config", "progress", "tables", "extras"}
     | {"transforms", "geometry", "viz", "diagnosis"},
-    "config": {"config", "options"},
+    "config": {"config", "options", "scenes", "yaml_file"},
     "options": set(),
+    "yaml_file": set(),
     "report": {"report", "viz", "config", "experiment", "agent", "envs", "scenes"}
     | {"extras", "tables", "files"},
 }

@@ -46,7 +46,7 @@ def view(*arguments):
 
 
 def options_of(config):
-    return episodes_of(config, load_scene(config.scene))
+    return episodes_of(config, config.scene)
 
 
 def driven(config, is_scene_given=True):

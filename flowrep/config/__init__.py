@@ -1,17 +1,8 @@
 """The commands' configs: their files, their schema (`schema`) and their command lines (`cli`)."""
 
-from collections.abc import Iterable
-from difflib import get_close_matches
-from pathlib import Path
+from flowrep.yaml_file import CONF_DIR, UsageError, closest_first
 
-_OURS = Path(__file__).resolve().parents[1] / "conf"
-# In a checkout it is a link to the one beside the package, for `pkg://flowrep.conf`; git makes none
-# on Windows.
-CONF_DIR = (_OURS if _OURS.is_dir() else _OURS.parents[1] / "conf").resolve()
-
-
-class UsageError(ValueError):
-    """A mistake on the command line; the message is all that the user needs to read."""
+__all__ = ["CONF_DIR", "UsageError", "closest_first", "config_groups", "group_choices"]
 
 
 def group_choices(group: str) -> list[str]:
@@ -23,14 +14,3 @@ def config_groups() -> list[str]:
     """Returns the names of flowrep's config groups, sorted: the folders of conf/ except Hydra's."""
     folders = (path for path in CONF_DIR.iterdir() if path.is_dir())
     return sorted(path.name for path in folders if path.name not in ("hydra", "__pycache__"))
-
-
-def closest_first(name: str, choices: Iterable[str]) -> str:
-    """Returns choices as text, sorted, but those that look like a misspelt name first.
-
-    >>> closest_first("strait_road", ["h_shaped_pathways", "s_turn", "straight_road"])
-    'straight_road, h_shaped_pathways, s_turn'
-    """
-    there = sorted(choices)
-    near = get_close_matches(name, there)
-    return ", ".join([*near, *(choice for choice in there if choice not in near)])

@@ -102,6 +102,21 @@ class ForeignAlgorithm(AlgorithmOptions):
     target: str = Field(alias="_target_", pattern=CLASS)
 
 
+def _scene(value: Any) -> Any:
+    """Returns a section `scene` as the `Scene` that it describes."""
+    from flowrep.scenes import Scene, load_scene  # costs 0.1 s, which --help doesn't need
+
+    if not isinstance(value, Mapping | Scene):  # a name would read a file
+        raise ValueError(f"should be the keys of a scene, as in conf/scene, not {value!r}")
+    return load_scene(value)
+
+
+def _scene_data(scene: Any) -> Any:
+    from flowrep.scenes.load import scene_data
+
+    return scene_data(scene)
+
+
 def _kind(section: Any) -> str:
     """Returns which options an algorithm's section holds."""
     if isinstance(section, Mapping):
@@ -112,9 +127,12 @@ def _kind(section: Any) -> str:
 
 
 if TYPE_CHECKING:
+    from flowrep.scenes import Scene
+
     Stack = dict[str, dict[str, Any]]
     Algorithm = AlgorithmOptions
 else:
+    Scene = Annotated[Any, BeforeValidator(_scene), PlainSerializer(_scene_data)]
     Stack = Annotated[
         Representations, WrapValidator(_in_their_order), PlainSerializer(lambda value: value)
     ]
@@ -151,7 +169,7 @@ class EnvConfig(Command):
     flow: Flow
     motion: MotionSource
     noise: Noise
-    scene: dict[str, Any]  # flowrep.scenes.load_scene makes a Scene of it
+    scene: Scene
 
 
 Acting = Literal["greedy", "sampled"]
@@ -220,7 +238,7 @@ class EvaluateConfig(Command):
 
     run: Annotated[list[Text] | None, OneOrMore]
     algorithm: Trusted
-    scene: dict[str, Any] | None = None
+    scene: Scene | None = None
     representations: Stack | None = None
     flow: Flow | None = None
     motion: MotionSource | None = None
@@ -284,7 +302,7 @@ class ExportConfig(Command):
 class ViewConfig(Command):
     """The whole config of `flowrep.view`."""
 
-    scene: dict[str, Any]
+    scene: Scene
     representations: Stack | None = None
     policy: Text
     algorithm: Trusted
@@ -428,7 +446,8 @@ def _line(details: Any) -> str:
     if kind == "missing":
         return f"{key} needs a value: {key}=..."
     if kind == "value_error":
-        return f"{key}: {message}" if key else message
+        names_itself = key == "" or message.startswith(f"{key} ")  # as a scene's own
+        return message if names_itself else f"{key}: {message}"
     remedy = ""
     if kind == "list_type":
         remedy = f"; write '{key}=[{value}]'"

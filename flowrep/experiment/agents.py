@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ from flowrep.experiment.outcomes import EpisodeRecord
 from flowrep.experiment.run import RunFolder, check_policy, origin_of
 from flowrep.experiment.runner import EVALUATION_ENVS, Runner
 from flowrep.progress import StopRequest
-from flowrep.scenes import load_scene
+from flowrep.scenes import Scene, load_scene
 
 PRETRAINED = Path(__file__).parents[1] / "pretrained"
 """Agents that come with flowrep, one for each scene; README.md there is their card."""
@@ -84,14 +84,14 @@ class Agent(Driver):
                 runner.train(stop)
         if stop:
             raise KeyboardInterrupt(f"stopped after {runner.frames} frames; saved in {run.path}")
-        return cls(runner.agent.policy, config, runner.frames, config.scene["name"])
+        return cls(runner.agent.policy, config, runner.frames, config.scene.name)
 
     @classmethod
     def load(
         cls,
         name: str | Path,
         *,
-        scene: str | Mapping[str, Any] | None = None,
+        scene: str | Mapping[str, Any] | Scene | None = None,
         representations: Mapping[str, Any] | Sequence[str] | None = None,
         flow: Any = None,
         motion: str | None = None,
@@ -126,8 +126,7 @@ class Agent(Driver):
         check_policy(name := str(name))
         machine: dict[str, Any] = {"device": device, "num_workers": num_workers}
         machine |= {} if num_envs is None else {"num_envs": num_envs}
-        if isinstance(scene, str):
-            scene = asdict(load_scene(scene))
+        given_scene = None if scene is None else load_scene(scene)
         is_folder = Path(name).is_dir()  # of a run, whose name may hold a colon
         is_saved = not is_folder and name.endswith(".safetensors")
         is_external = not (is_folder or is_saved) and (":" in name or name.endswith(".pt2"))
@@ -147,7 +146,7 @@ class Agent(Driver):
             if is_external and not maps:
                 raise UsageError(f"representations needs a value for policy={name}")
             asked: dict[str, Any] = {
-                "scene": scene or asdict(load_scene("straight_road")),
+                "scene": given_scene or load_scene("straight_road"),
                 "representations": {"rgb": {}},  # replaced: options that are left out have defaults
                 "flow": flow or ExactFlow(),
                 "motion": motion or "exact",
@@ -160,12 +159,12 @@ class Agent(Driver):
             config = validated(EnvConfig, asked | machine)
             config = config.model_copy(update={"representations": maps if is_external else {}})
             return cls(_external(name, config) if is_external else name, config)
-        trained, frames, weights = _stored(name, scene, trusted)
+        trained, frames, weights = _stored(name, given_scene, trusted)
         section = trained.algorithm
         if precision is not None and hasattr(build.algorithm(section)[1], "precision"):
             machine["algorithm"] = section.model_copy(update={"precision": precision})
-        if scene is not None:
-            machine["scene"] = {**scene, "camera": trained.scene["camera"]}
+        if given_scene is not None:
+            machine["scene"] = replace(given_scene, camera=trained.scene.camera)
         config = trained.model_copy(update=machine)
         with closing(build.env(config, num_envs=1, num_workers=0)) as env:
             policy = build.policy(config, env)
@@ -174,10 +173,10 @@ class Agent(Driver):
         except RuntimeError as error:
             reason = str(error).splitlines()[-1].strip()
             raise CheckpointError(
-                f"the agent of {name} can't be used in scene '{config.scene['name']}', whose "
+                f"the agent of {name} can't be used in scene '{config.scene.name}', whose "
                 f"classes are not those of its training ({reason})"
             ) from error
-        return cls(policy, config, frames, trained.scene["name"])
+        return cls(policy, config, frames, trained.scene.name)
 
     def evaluate(
         self,
@@ -202,7 +201,7 @@ class Agent(Driver):
         asked = {
             "episodes": episodes,
             "speeds": speeds or [self.config.speed],
-            "fps": fps or [load_scene(self.config.scene).frame_rate_hz],
+            "fps": fps or [self.config.scene.frame_rate_hz],
             "seed": seed,
             "policies": policies,
             "baselines": baselines,
@@ -229,7 +228,7 @@ class Agent(Driver):
 
 
 def _stored(
-    name: str, scene: Mapping[str, Any] | None, trusted: Collection[str]
+    name: str, scene: Scene | None, trusted: Collection[str]
 ) -> tuple[TrainConfig, int, dict[str, Tensor]]:
     """Returns config, frames and weights of a trained agent."""
     is_folder = Path(name).is_dir()
@@ -253,15 +252,16 @@ def _weights(state: Mapping[str, Any], path: Path) -> dict[str, Tensor]:
     return weights
 
 
-def _pretrained(scene: Mapping[str, Any] | None) -> Path:
+def _pretrained(scene: Scene | None) -> Path:
     if scene is None:
         raise UsageError("scene needs a value for policy=pretrained")
     files = {file.stem: file for file in PRETRAINED.glob("*.safetensors")}
-    name = scene.get("name")
-    if name not in files:
-        there = closest_first(str(name), files)
-        raise UsageError(f"no agent for scene '{name}' comes with flowrep; there are: {there}")
-    return files[name]
+    if scene.name not in files:
+        there = closest_first(scene.name, files)
+        raise UsageError(
+            f"no agent for scene '{scene.name}' comes with flowrep; there are: {there}"
+        )
+    return files[scene.name]
 
 
 def _external(reference: str, config: EnvConfig) -> Any:
@@ -269,7 +269,7 @@ def _external(reference: str, config: EnvConfig) -> Any:
     with closing(build.env(config, num_envs=1, num_workers=0)) as env:
         maps = {name: env.observation_spec[name][0] for name in config.representations}
         task = Task(
-            scene=config.scene["name"],
+            scene=config.scene.name,
             representations=config.representations,
             observation_spec=Composite(maps),
             action_spec=env.action_spec[0],

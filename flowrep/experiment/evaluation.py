@@ -26,7 +26,7 @@ from flowrep.envs.episode import hit_name
 from flowrep.experiment import build
 from flowrep.experiment.outcomes import EpisodeRecord
 from flowrep.progress import StopRequest, progress_bar
-from flowrep.scenes import Scene, load_scene
+from flowrep.scenes import Scene
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
@@ -52,7 +52,7 @@ class Driver:
 
     def origin(self, evaluation: str) -> dict[str, Any]:
         """Returns the fields of an `EpisodeRecord` that say which agent drove where."""
-        scene = load_scene(self.config.scene)
+        scene = self.config.scene
         return {
             "scene": scene.name,
             "scene_id": scene_id(scene),

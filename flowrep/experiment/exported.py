@@ -55,7 +55,7 @@ def export(agent: Driver, folder: Path) -> None:
         "intrinsics": street.K.tolist(),
         "num_classes": street.num_classes,
         "frame_rate_hz": street.frame_rate_hz,
-        "scene": config.scene["name"],
+        "scene": config.scene.name,
         "algorithm": config.algorithm.plain(),
         "frames": agent.frames,
     }

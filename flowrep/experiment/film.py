@@ -242,7 +242,7 @@ def _picture_scale(agent: Driver) -> int:
     config = agent.config
     if "rgb" in config.representations or choose_renderer(config.renderer) == "pybullet":
         return 1
-    return tile_zoom(config.scene["camera"]["height_px"], config.scene["camera"]["width_px"])
+    return tile_zoom(config.scene.camera.height_px, config.scene.camera.width_px)
 
 
 def _plain(spec: Any) -> Callable[[Any], Image]:

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from flowrep import __version__
 from flowrep.config import UsageError
 from flowrep.config.schema import BaselineName, TrainConfig, validated_run
-from flowrep.config.yaml_file import read_yaml
 from flowrep.experiment.lock import FolderLock, RunFolderError, locked
 from flowrep.experiment.loggers import Loggers
 from flowrep.experiment.outcomes import (
@@ -34,6 +33,7 @@ from flowrep.experiment.outcomes import (
 )
 from flowrep.files import replace_file, replace_text, set_aside
 from flowrep.tables import append_rows, is_whole, read_rows, write_rows
+from flowrep.yaml_file import read_yaml
 
 if TYPE_CHECKING:
     import torch

@@ -28,10 +28,10 @@ from omegaconf import DictConfig
 
 from flowrep.config import UsageError, cli
 from flowrep.config.schema import ALGORITHMS, TrainConfig, validated, validated_run
-from flowrep.config.yaml_file import read_yaml
 from flowrep.experiment.outcomes import is_finished, success_of
 from flowrep.files import open_to_append
 from flowrep.progress import STOP_SIGNALS, StopRequest
+from flowrep.yaml_file import read_yaml
 
 cli.register_resolvers()  # for the paths in conf/run_folder.yaml, which a worker resolves too
 

@@ -10,11 +10,10 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from flowrep.config import CONF_DIR, UsageError, closest_first
-from flowrep.config.yaml_file import read_yaml
 from flowrep.scenes.checks import check_path, check_references, check_walks
 from flowrep.scenes.layout import Layout
 from flowrep.scenes.scene import Scene, SceneError
+from flowrep.yaml_file import CONF_DIR, UsageError, closest_first, read_yaml
 
 
 def load_scene(scene: str | Path | Mapping[str, Any] | Scene) -> Scene:
@@ -50,6 +49,16 @@ def load_scene(scene: str | Path | Mapping[str, Any] | Scene) -> Scene:
 def scene_names() -> list[str]:
     """Returns the names of the scenes in `conf/scene`."""
     return sorted(path.stem for path in (CONF_DIR / "scene").glob("*.yaml"))
+
+
+def scene_data(scene: Scene) -> dict[str, Any]:
+    """Returns a scene as YAML has it, without keys that have their default.
+
+    >>> load_scene(scene_data(load_scene("s_turn"))) == load_scene("s_turn")
+    True
+    """
+    data: dict[str, Any] = _adapter().dump_python(scene, mode="json", exclude_defaults=True)
+    return data
 
 
 def json_schema() -> str:

@@ -13,6 +13,7 @@ from flowrep.config.schema import (
     validated,
     validated_run,
 )
+from flowrep.scenes import Scene
 from tests.config.composing import composed, plain
 
 
@@ -168,3 +169,28 @@ def test_a_command_has_the_keys_of_its_schema(name, model, given):
     config = plain(name, *given)
     assert sorted(config) == sorted(model.model_fields)
     validated(model, config)
+
+
+def test_a_configs_scene_is_checked_and_stored_as_it_was_written():
+    written = plain("train", "scene=s_turn", "scene.time_limit_steps=7")
+    config = validated(TrainConfig, written)
+    assert isinstance(config.scene, Scene)
+    assert (config.scene.name, config.scene.time_limit_steps) == ("s_turn", 7)
+    assert config.plain()["scene"] == written["scene"]
+    assert validated_run(config.plain(), "config.yaml").scene == config.scene
+
+
+@pytest.mark.parametrize(
+    ("scene", "says"),
+    [
+        ({"name": "s_turn"}, "scene 's_turn': frame_rate_hz"),
+        ("s_turn", "scene: "),  # of a stored config, which must not name a file to read
+        ("elsewhere.yaml", "scene: "),
+        (None, "scene: "),
+    ],
+)
+def test_a_scene_that_is_none_is_refused_by_its_key(scene, says):
+    with pytest.raises(UsageError) as caught:
+        validated(TrainConfig, plain("train") | {"scene": scene})
+    assert str(caught.value).startswith(says)
+    assert "\n" not in str(caught.value)

@@ -1,6 +1,7 @@
 """Agents from Python: trained, evaluated, saved and loaded, and those that come with flowrep."""
 
 import signal
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from flowrep.agent import CheckpointError, save_checkpoint
 from flowrep.config import UsageError, group_choices
 from flowrep.experiment.agents import PRETRAINED, Agent, packed, unpacked
 from flowrep.experiment.run import RunFolder
+from flowrep.scenes import load_scene
 from tests.comparing import differing
 from tests.config.composing import composed
 
@@ -234,12 +236,12 @@ def test_it_drives_where_one_that_never_turns_does_not(scene):
 
 def test_a_scene_with_changes_is_driven_with_the_camera_of_training():
     whole = Agent.load("pretrained", scene="straight_road", device="cpu").config.scene
-    scene = {**whole, "time_limit_steps": 7, "camera": {**whole["camera"], "height_px": 84}}
+    scene = replace(whole, time_limit_steps=7, camera=replace(whole.camera, height_px=84))
     agent = Agent.load("pretrained", scene=scene, device="cpu")
-    assert agent.config.scene["time_limit_steps"] == 7
-    assert agent.config.scene["camera"]["height_px"] == 48
+    assert agent.config.scene.time_limit_steps == 7
+    assert agent.config.scene.camera.height_px == 48
 
 
 def test_a_scene_without_one_is_told_which_there_are():
     with pytest.raises(UsageError, match="straight_road"):
-        Agent.load("pretrained", scene={"name": "my_street"})
+        Agent.load("pretrained", scene=replace(load_scene("s_turn"), name="my_street"))

@@ -6,7 +6,8 @@ import pytest
 import yaml
 
 from flowrep.scenes import SceneError, load_scene
-from flowrep.scenes.load import json_schema
+from flowrep.scenes.load import json_schema, scene_data
+from flowrep.yaml_file import CONF_DIR
 
 CROSSROADS = Path(__file__).parent / "crossroads.yaml"
 SCHEMA = Path(__file__).parents[2] / "docs" / "scene.schema.json"
@@ -65,3 +66,13 @@ def test_merge_keys_and_anchors_of_yaml_may_be_used(tmp_path, data):
 
 def test_the_schema_for_editors_is_that_of_the_code():
     assert SCHEMA.read_text(encoding="utf-8") == json_schema(), "make schema"
+
+
+@pytest.mark.parametrize("file", [*sorted((CONF_DIR / "scene").glob("*.yaml")), CROSSROADS])
+def test_a_scene_is_written_as_its_file_has_it(file):
+    written = yaml.safe_load(yaml.safe_dump(scene_data(load_scene(file))))
+    assert written == yaml.safe_load(file.read_text(encoding="utf-8"))
+
+
+def test_a_key_with_its_default_is_the_same_as_no_key(data):
+    assert "terrain_m" not in scene_data(load_scene({**data, "terrain_m": 0.0}))

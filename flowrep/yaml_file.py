@@ -1,16 +1,24 @@
-"""Reads YAML that a user wrote: what is wrong with it is one line, with the file and the line."""
+"""Reads YAML, of `conf/` and of users: what is wrong with it is one line, with file and line."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from flowrep.config import UsageError
-
+_OURS = Path(__file__).resolve().parent / "conf"
+# In a checkout it is a link to the one beside the package, for `pkg://flowrep.conf`; git makes none
+# on Windows.
+CONF_DIR = (_OURS if _OURS.is_dir() else _OURS.parents[1] / "conf").resolve()
 MAX_NODES = 100_000
 """Values of a file in which aliases are written out: each scene of flowrep's has some thousand."""
+
+
+class UsageError(ValueError):
+    """A mistake of the user; the message is all that one needs to read."""
 
 
 class _Loader(yaml.SafeLoader):
@@ -73,3 +81,14 @@ def read_yaml(path: str | Path) -> Any:
     # the last two are PyYAML's at `!!bool x` and `!!timestamp x`
     except (OSError, ValueError, yaml.YAMLError, KeyError, AttributeError) as error:
         raise UsageError(f"{path}: can't be read: {' '.join(str(error).split())}") from error
+
+
+def closest_first(name: str, choices: Iterable[str]) -> str:
+    """Returns choices as text, sorted, but those that look like a misspelt name first.
+
+    >>> closest_first("strait_road", ["h_shaped_pathways", "s_turn", "straight_road"])
+    'straight_road, h_shaped_pathways, s_turn'
+    """
+    there = sorted(choices)
+    near = get_close_matches(name, there)
+    return ", ".join([*near, *(choice for choice in there if choice not in near)])
