@@ -1,9 +1,9 @@
 """YAML of a user, or of a stranger, is data, or one line that says what is wrong with it."""
 
 import pytest
-from flowrep.config.yaml_file import read_yaml
 
 from flowrep.config import UsageError
+from flowrep.yaml_file import read_yaml
 
 # Each list holds the one before twice: 2 ** 17 - 1 values and lists in line 16.
 DOUBLED = "a0: &a0 [x, x]\n" + "".join(
