@@ -448,6 +448,31 @@ def test_round_bodies_between_whose_pixels_depth_is_not_exact_are_right():
     assert diagnose(TensorDict({"sensor": sensor}, [20]), K).verdict == "wrong"
 
 
+@pytest.mark.parametrize(("step", "is_told"), [((0.1, 0.0, 0.0), True), ((0.0, 0.0, -0.2), False)])
+def test_what_depth_cannot_tell_of_a_flat_bodys_motion_is_said(step, is_told):
+    # a plate 4 m ahead, parallel to the picture, that moves aside or nears the camera; the wall is
+    # tilted, so that the camera's motion shows
+    v, u = torch.meshgrid(torch.arange(36) + 0.5, torch.arange(52) + 0.5, indexing="ij")
+    x, y = (u - 24.5) / 44, (v - 17.2) / 46
+    depths, ids, plate_motion = [], [], torch.eye(4)
+    plate_motion[:3, 3] = -torch.tensor(step) + torch.tensor([0.0, 0.0, 0.12])
+    for t in range(16):
+        wall = (8 - 0.12 * t) / (1 + 0.2 * x + 0.1 * y)
+        far, centre = 4 + t * (step[2] - 0.12), t * step[0] - 0.8
+        is_plate = ((x * far - centre).abs() < 1.0) & ((y * far).abs() < 0.8)
+        depths.append(torch.where(is_plate, torch.tensor(far), wall)[None])
+        ids.append(is_plate.long()[None])
+    motion = torch.eye(4)
+    motion[2, 3] = 0.12
+    rows = torch.stack([motion, plate_motion]).repeat(16, 1, 1, 1)
+    sensor = {"depth": torch.stack(depths), "instance": torch.stack(ids)}
+    sensor |= {"instance_motion": rows, "prev_from_curr": rows[:, 0]}
+    K = torch.tensor([[44.0, 0, 24.5], [0, 46.0, 17.2], [0, 0, 1]])
+    found = diagnose(TensorDict({"sensor": sensor}, [16]), K)
+    assert found.is_right
+    assert any("motions of bodies are not tested" in note for note in found.notes) == is_told
+
+
 def test_noise_of_depth_is_no_mistake_of_the_focal_length():
     v, u = torch.meshgrid(torch.arange(48) + 0.5, torch.arange(64) + 0.5, indexing="ij")
     rays = torch.stack([(u - 32) / 47, (v - 24) / 47, torch.ones_like(u)]).double()

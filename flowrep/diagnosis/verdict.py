@@ -314,7 +314,9 @@ def fitted(
 ) -> _Fit:
     """Returns what pairs leave by the best motion, of a rival with its numbers `[P, k]`."""
     none, error = pairs.depth[:, :0], apart(pairs, pairs.motion, motion)
-    if not pairs.path[:, 1].isfinite().any():  # without poses, the best motion is as good as any
+    # Without poses, the best motion is as good as any. With them, a rival may need one beyond the
+    # recording's ends: what it leaves there is unknown.
+    if not pairs.has_poses and (rival is None or rival.of != "poses"):
         error = torch.zeros_like(error)
     rival = rival or Rival("poses", "", "", lambda pairs, n: pairs)
     n = none if n is None else n
