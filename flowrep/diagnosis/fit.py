@@ -189,9 +189,9 @@ def apart(pairs: Pairs, one: Tensor, other: Tensor) -> Tensor:
 
 
 def median(values: Tensor) -> float:
-    """Returns the median of known values, inf if half of them or more are not."""
+    """Returns the median of known values, inf if most are not."""
     unknown = int(values.isnan().sum())
-    return math.inf if 2 * unknown >= values.numel() else float(values.nanmedian())
+    return math.inf if 2 * unknown > values.numel() else float(values.nanmedian())
 
 
 def small_motion(step: Tensor) -> Tensor:

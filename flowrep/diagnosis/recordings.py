@@ -125,7 +125,7 @@ def why_not(pairs: Pairs) -> list[str]:
     still, stands = (tells & ~moves).nonzero()[:, 0], torch.zeros_like(moves)
     if len(still) and pairs.has_poses:
         few = pairs.of(still, slice(FITTED))._replace(by_flow=False, scale_px=0.5)
-        rest = fitted(few, best_motion(few, few.motion))
+        rest = fitted(few, best_motion(few, few.motion), few.has_poses)
         stands[still] = rest.shown > max(rest.least, _LEAST_MOVEMENT_PX)
     return [
         "depth is nowhere known" if not d else "too few pixels are known" if n < _LEAST_PIXELS else

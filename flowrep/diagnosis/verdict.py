@@ -288,7 +288,7 @@ def _explanations(
         known = [pairs.motion, *known]
         starts = [pairs.motion, fit.least_costly(few, torch.stack(known)), *starts]
 
-    recorded, others = fitted(pairs, best_motion(pairs, *starts, steps=8)), []
+    recorded, others = fitted(pairs, best_motion(pairs, *starts, steps=8), has_poses), []
     if has_poses and recorded.left < (_EXACT_PX if pairs.by_flow else INTERPOLATED_PX):
         return recorded, []
     left = median(px_of(residual(few, pairs.motion if has_poses else recorded.motion)))
@@ -305,18 +305,18 @@ def _explanations(
             if not median(px_of(few_left)) <= left:
                 continue
             motion = best_motion(changed, changed.motion)
-        others.append(fitted(changed, motion, rival, n))
+        others.append(fitted(changed, motion, has_poses, rival, n))
     return recorded, others
 
 
 def fitted(
-    pairs: Pairs, motion: Tensor, rival: Rival | None = None, n: Tensor | None = None
-) -> _Fit:
+    pairs: Pairs, motion: Tensor, has_poses: bool, rival: Rival | None = None,
+    n: Tensor | None = None,
+) -> _Fit:  # fmt: skip
     """Returns what pairs leave by the best motion, of a rival with its numbers `[P, k]`."""
+    # A rival may need a pose beyond the recording's ends: what it leaves there is unknown.
     none, error = pairs.depth[:, :0], apart(pairs, pairs.motion, motion)
-    # Without poses, the best motion is as good as any. With them, a rival may need one beyond the
-    # recording's ends: what it leaves there is unknown.
-    if not pairs.has_poses and (rival is None or rival.of != "poses"):
+    if not has_poses:  # the best motion is as good as any
         error = torch.zeros_like(error)
     rival = rival or Rival("poses", "", "", lambda pairs, n: pairs)
     n = none if n is None else n
