@@ -4,6 +4,7 @@ import json
 import os
 import sys
 from contextlib import suppress
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import numpy as np
@@ -23,6 +24,7 @@ from flowrep.experiment.agents import Agent
 from flowrep.experiment.lock import RunFolderError
 from flowrep.experiment.run import RunFolder
 from flowrep.export import run as export
+from flowrep.scenes import SceneError, load_scene
 from flowrep.train import resumed
 from flowrep.view import agent_of
 from tests.config.composing import composed, plain
@@ -260,8 +262,8 @@ def test_a_pretrained_agent_is_one_of_the_files_that_come_with_flowrep(tmp_path,
     monkeypatch.setattr(agents, "PRETRAINED", tmp_path / "folder")
     (tmp_path / "folder").mkdir()
     (tmp_path / "x.safetensors").write_text("")
-    with pytest.raises(UsageError, match="comes with flowrep"):
-        Agent.load("pretrained", scene={"name": name})
+    with pytest.raises(SceneError, match="name: "):  # names are letters, digits, _ and -
+        Agent.load("pretrained", scene=asdict(load_scene("straight_road")) | {"name": name})
 
 
 def test_the_process_in_a_lock_is_plain_text(tmp_path):
