@@ -1,4 +1,4 @@
-"""The page of results: `make results` writes docs/results.md and its figure.
+"""The page of results: `make results` writes docs/results.md and its figures.
 
 claims.py tests what claims.yaml declares, results.md.jinja has the words around the numbers, and
 all numbers come from the packed runs.
@@ -28,6 +28,8 @@ from docs.claims import (
     claims_of,
     conditions_of,
     contrast_of,
+    held_out_cells,
+    held_out_claims,
     measure_of,
     scores,
     studies_of,
@@ -453,8 +455,8 @@ def sampled_minus_greedy(runs: Sequence[Run]) -> list[list[float]]:
     return by_run
 
 
-def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figure]:
-    """Returns the page and its figure."""
+def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[str, Figure]]:
+    """Returns the page and its figures by file."""
     studies = studies_of(declared, runs)
     primary, secondary = claims_of(declared, studies)
     # the second protocol has runs in some scenes only
@@ -470,6 +472,10 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
     failed = [r for r in every if _share(r.under(_as_trained(r))["outcome"]) < _HARDLY_EVER]
     with (DATA / EARLIER).open(encoding="utf-8", newline="") as file:
         earlier = {int(row["row"]): row for row in csv.DictReader(file)}
+    cells = held_out_cells(declared, studies)
+    figures = {FIGURE: draw_claims([*primary, *secondary])}
+    if cells:
+        figures[HELD_OUT_FIGURE] = draw_held_out(cells)
     smallest = smallest_differences(primary) or [float("nan")]
     text = (
         TEMPLATES.overlay(loader=FileSystemLoader(HERE))
@@ -478,6 +484,9 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
             primary=claims_table(primary, "p (Holm)"),
             secondary=claims_table(secondary, "p"),
             recipes=recipes_table(primary, earlier),
+            held_out=held_out_table(held_out_claims(declared, cells)) if cells else "",
+            cells={cell.title: cell_table(cell) for cell in cells},
+            held_out_figure=HELD_OUT_FIGURE,
             # row 14 against the paper's other stack of two frames, row 19 at each speed alone
             against_depth=beside("frame_rate", "depth2", {12: 1, 6: -1}),
             alone={speed: beside("wide_confirmation", "raw", {speed: 1}) for speed in SPEEDS},
@@ -493,7 +502,7 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
             variations=variation_table(declared["variations"], studies),
             estimates=estimates_table(declared["estimates"], studies),
             runs=runs_table({s: of for s, of in studies.items() if s not in declared["estimates"]}),
-            commands=declared["commands"],
+            commands={study: c for study, c in declared["commands"].items() if studies[study]},
             number=len(runs),
             pixels=sorted(
                 {"{height_px} × {width_px}".format(**r.config["scene"]["camera"]) for r in every}
@@ -510,15 +519,16 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
             np=np,
         )
     )
-    return text, draw_claims([*primary, *secondary])
+    return text, figures
 
 
 def main(data: Path = DATA, page: Path = PAGE) -> None:
     """Entry point."""
     declared = yaml.safe_load(CLAIMS.read_text(encoding="utf-8"))
-    text, figure = render(declared, read_archive(data))
+    text, figures = render(declared, read_archive(data))
     page.write_text(text, encoding="utf-8")
-    (page.parent / FIGURE).write_bytes(encoded(figure, "svg"))
+    for name, figure in figures.items():
+        (page.parent / name).write_bytes(encoded(figure, "svg"))
     print(f"{page}: {len(text.split()):,} words")
 
 

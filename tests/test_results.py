@@ -221,6 +221,25 @@ def test_held_out_speeds_are_those_of_each_split_and_are_corrected_together():
     assert "2 and 0" in results.held_out_table([first])
 
 
+def test_the_page_begins_with_held_out_speeds_once_their_runs_are_stored():
+    runs = read_archive(results.DATA) if is_archive(results.DATA) else []
+    if not runs:
+        pytest.skip("source distributions have no runs")
+    more = []
+    for split, mode in (("high", "high"), ("low", "low")):
+        for stack, number in (("raw", 2), ("ego+obj", 6), ("seg2", 3), ("ego+obj+seg2", 7)):
+            for seed in (40, 41):
+                ends = {mode: letters(number - seed % 2), "normal": letters(7)}
+                name = f"held_out_{split}_straight_road_{stack}_s{seed}"
+                more.append(run_of(name, ends, stack=stack, seed=seed))
+    before, _ = results.render(DECLARED, runs)
+    after, figures = results.render(DECLARED, [*runs, *more])
+    assert "## Held-out speeds" not in before
+    assert after.index("## Held-out speeds") < after.index("## The claims")
+    assert "H3" in after
+    assert {*figures} == {results.FIGURE, results.HELD_OUT_FIGURE}
+
+
 def test_a_split_shows_held_out_speeds_first_and_its_figure_has_a_panel_each():
     cells = held_out_cells(HELD_OUT, held_out_runs({"ego+obj": (6, 7), "raw": (2, 3)}))
     header, _, raw, flow, blind = results.cell_table(cells[1]).splitlines()
@@ -347,9 +366,9 @@ def test_the_primary_contrasts_are_those_of_the_protocol():
 @pytest.mark.slow
 @pytest.mark.skipif(not is_archive(results.DATA), reason="source distributions have no runs")
 def test_the_page_says_what_the_stored_runs_say():
-    text, _ = results.render(DECLARED, read_archive(results.DATA))
+    text, figures = results.render(DECLARED, read_archive(results.DATA))
     assert text == results.PAGE.read_text(encoding="utf-8"), "run `make results`"
-    assert (results.PAGE.parent / results.FIGURE).is_file()
+    assert all((results.PAGE.parent / figure).is_file() for figure in figures)
 
 
 @pytest.fixture(scope="module")
@@ -411,6 +430,8 @@ def identity(run):
 @pytest.mark.slow
 @pytest.mark.parametrize("study", DECLARED["studies"])
 def test_the_commands_of_a_study_make_its_stored_runs(stored, study):
+    if study in DECLARED["held_out"]["splits"] and not stored[study]:
+        pytest.skip("its runs are not stored yet")
     lines = DECLARED["commands"][study].replace("\\\n", "").splitlines()
     trained = [set(runs_of(line)) for line in lines if "flowrep.train" in line]
     assert set().union(*trained) == {identity(r) for of in stored[study].values() for r in of}

@@ -48,7 +48,7 @@ class Planner:
     """Follows a planned drive, and plans again if its actions were not taken.
 
     Args:
-        beams: beam widths; a wider beam is tried if no drive of a narrower one reaches the ending
+        beams: beam widths; a wider beam is tried if no drive of a narrower one reaches the end
             zone.
         margins_m: distances to keep from people, in the order in which they are tried.
         sees_speed: whether it knows how fast people walk. If not, it knows everyone's position and
