@@ -54,6 +54,8 @@ class Sensing:
         self._vehicle_from_cam = camera.vehicle_from_camera(config)
         self._ids_by_number = street.ids_by_number()
         self.renderer, self._scale = camera.choose_renderer(renderer), scale
+        if scale < 1 or scale % 1 != 0:
+            raise ValueError(f"picture_scale must be a whole number of at least 1, got {scale}")
         if scale != 1 and self.renderer == "pybullet":
             remedy = "needs renderer 'rasteriser'; give 1 with 'pybullet'"
             raise ValueError(f"picture_scale={scale} {remedy}")

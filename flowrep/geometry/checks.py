@@ -73,6 +73,14 @@ def check_name(option: str, name: object, names: Any) -> None:
         raise ValueError(f"{option} must be one of {known}, got {name!r}")
 
 
+def checked_count(option: str, count: float, least: int = 1, most: int | None = None) -> int:
+    """Returns a whole number as an int; raises ValueError for a fraction, or one out of range."""
+    if count % 1 != 0 or count < least or (most is not None and count > most):
+        limits = f"of at least {least}" if most is None else f"from {least} to {most}"
+        raise ValueError(f"{option} must be a whole number {limits}, got {count}")
+    return int(count)
+
+
 def check_rows(lowest: int, highest: int, rows: int) -> None:
     """Raises RuntimeError if some id from `lowest` to `highest` has no row among `rows` motions."""
     if lowest < 0 or highest >= rows:

@@ -1,10 +1,10 @@
 """TorchRL transforms that turn sensor maps into mid-level representations.
 
-`*B` is any leading batch. Every transform takes `in_keys` and `out_keys`, as in TorchRL one key (a
-string, or a tuple of strings if nested) or a list of keys; by default those in its table.
+`*B` is any leading batch. Every transform takes `in_keys` and `out_keys`: as in TorchRL, one key (a
+string, or a tuple of strings if nested) or a list of keys. The defaults are in its table.
 
-A constructor raises ValueError for a value that can't be used, and names the argument. A call
-raises ValueError for an input of another layout, and `MissingKey`, a KeyError, for a missing one.
+A constructor raises ValueError for an invalid argument, and names it. A call raises ValueError for
+an input of the wrong layout, and `MissingKey`, a KeyError, for a missing input.
 """
 
 from flowrep.transforms.adapt import AdaptDepth, AdaptFlow, AdaptPose, BodyRows

@@ -15,11 +15,12 @@ from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 
 from flowrep import geometry
+from flowrep.geometry.checks import checked_count
 from flowrep.geometry.depth import check_depth_options
 from flowrep.geometry.flow import check_flow_options
 from flowrep.geometry.pose import POSE_SHAPES, check_pose_options
 from flowrep.transforms import base
-from flowrep.transforms.base import Keys, MapTransform, Reads, check_own_keys, flags_of_batch
+from flowrep.transforms.base import Keys, MapTransform, Reads, check_distinct_keys, flags_of_batch
 from flowrep.transforms.flow import CameraTransform, Intrinsics
 
 
@@ -67,7 +68,7 @@ class AdaptDepth(CameraTransform):
         shape = ("H", "W", 1) if channels_last else base.DEPTH.shape
         reads = Reads(shape, "float" if scale_m is None else "any")
         super().__init__(intrinsics, [reads], in_keys, out_keys)
-        check_own_keys(self)
+        check_distinct_keys(self)
         self.options: dict[str, Any] = {"kind": kind, "near_m": near_m, "far_m": far_m}
         self.options |= {"scale_m": scale_m, "nothing": nothing, "sky": sky}
         self.channels_last = channels_last
@@ -126,7 +127,7 @@ class AdaptPose(MapTransform):
     ) -> None:
         check_pose_options(layout, direction, axes)
         super().__init__([Reads(POSE_SHAPES[layout], "float")], in_keys, out_keys)
-        check_own_keys(self)
+        check_distinct_keys(self)
         self.options: dict[str, Any] = {"layout": layout, "direction": direction, "axes": axes}
         self.check = bool(check)
 
@@ -197,7 +198,7 @@ class AdaptFlow(MapTransform):
         check_flow_options(direction, grid, channels)
         reads = Reads(("H", "W", 2), "float") if channels_last else base.FLOW
         super().__init__([reads], in_keys, out_keys)
-        check_own_keys(self)
+        check_distinct_keys(self)
         self.options: dict[str, Any] = {"direction": direction, "grid": grid, "channels": channels}
         self.channels_last = channels_last
 
@@ -218,10 +219,11 @@ class BodyRows:
 
     `InstanceMotion` compares row i of this step's poses with row i of the previous step's. A row
     must therefore stay with its body, and must be empty for a step before another body takes it.
-    Empty rows hold nan, which makes flow unknown; with another body's pose it would be a jump.
+    Empty rows hold nan, so that flow is unknown there; the next body's pose would look like a jump.
 
     Args:
-        count: the number of rows: for all bodies that exist at once, and those that have just left.
+        count: the number of rows, enough for all bodies that exist at once and all that have just
+            left.
 
     Example:
         >>> rows = BodyRows(3)
@@ -236,11 +238,11 @@ class BodyRows:
     """
 
     def __init__(self, count: int) -> None:
-        self.count = count
+        self.count = checked_count("count", count)
         self.clear()
 
     def clear(self) -> None:
-        """Forgets all bodies; to be called at a reset."""
+        """Forgets all bodies; call it at each reset."""
         self._row_of: dict[Hashable, int] = {}
 
     def __call__(self, poses: Mapping[Hashable, Tensor]) -> Tensor:

@@ -23,7 +23,7 @@ class MissingKey(KeyError):
     """A transform needs a key that the TensorDict or the env's specs lack."""
 
     def __str__(self) -> str:
-        """Returns the message; KeyError's own method would return its repr, in quotes."""
+        """Returns the message without the quotes that KeyError adds."""
         return str(self.args[0])
 
 
@@ -66,12 +66,11 @@ class MapTransform(Transform):
         writes: the number of outputs, each of which needs a key.
 
     Attributes:
-        label: the representations that it serves, for error messages; by default its out_keys.
+        label: the representations that it serves, for error messages; by default its `out_keys`.
         compiled: whether `compute` runs through `torch.compile`; False by default.
 
     Raises:
-        ValueError: `in_keys` or `out_keys` has another number of keys than the transform reads or
-            writes.
+        ValueError: the number of `in_keys` or `out_keys` is not the number of inputs or outputs.
     """
 
     # Pure: takes one tensor per input key, returns one per output key.
@@ -97,20 +96,21 @@ class MapTransform(Transform):
         self.label = " and ".join(repr(key) for key in self.out_keys)
 
     def _inputs(self, source: TensorDictBase | Composite) -> list[Any]:
-        """Returns the tensors or the specs under `in_keys`, of the layouts that `reads` says."""
+        """Returns the tensors or the specs under `in_keys`, once their layouts fit `reads`."""
         maps = [source.get(key, None) for key in self.in_keys]
         for key, value in zip(self.in_keys, maps):
             if value is None:
                 offered = sorted(source.keys(True, True), key=str)
                 remedy = "Name another one with in_keys=, or let the env emit it."
                 if key[0] == "sensor" and source.get("sensor", None) is None:
-                    remedy += " make_env drops its sensors' keys unless it gets keep_sensor=True."
+                    remedy += " make_env drops sensor keys unless it gets keep_sensor=True."
                 raise MissingKey(
                     f"representation {self.label} needs key {key!r}; the env offers {offered}. "
                     f"{remedy}"
                 )
-        # `*B` is what precedes the first input's own dims, as long as it begins with the
-        # TensorDict's batch: a spec or a TensorDict without a batch may hold inputs that have one.
+        # `*B` is the first input's leading dims if these begin with the TensorDict's batch size,
+        # since a spec or a TensorDict without batch size may hold batched inputs. If they don't,
+        # `*B` is the batch size, and the check below fails.
         batch, leading = source.shape, maps[0].shape[: -len(self.reads[0].shape)]
         if leading[: len(batch)] == batch:
             batch = leading
@@ -161,8 +161,8 @@ class MapTransform(Transform):
         rows = flags_of_batch(begins, tensordict_reset)
         if rows.all() == rows.any():
             return self._call(tensordict_reset)
-        # TorchRL keeps only the rows that are reset: the others need not be computed, which matters
-        # for estimated flow.
+        # TorchRL keeps only the rows that are reset. Computing the others, too, would be slow for
+        # estimated flow.
         reset = self._call(tensordict_reset[rows])
         for key in self.out_keys:
             if (value := reset.get(key, None)) is not None:
@@ -324,14 +324,13 @@ def as_keys(keys: Keys) -> list[NestedKey]:
     return [key if isinstance(key, str) else tuple(key) for key in keys]
 
 
-def check_own_keys(transform: MapTransform) -> None:
+def check_distinct_keys(transform: MapTransform) -> None:
     """Raises ValueError if a transform would overwrite a key that it reads."""
     shared = sorted({str(key) for key in transform.in_keys} & {str(k) for k in transform.out_keys})
     if shared:
         raise ValueError(
-            f"{type(transform).__name__} reads and writes {', '.join(shared)}: a second pass, in a "
-            "replay buffer for instance, would convert what is converted already; give out_keys= "
-            "other names"
+            f"{type(transform).__name__} reads and writes {', '.join(shared)}: a second pass, for "
+            "instance in a replay buffer, would convert it twice; give out_keys= other names"
         )
 
 
@@ -345,14 +344,14 @@ def check_choice(option: str, chosen: Sequence[str], known: Collection[str]) -> 
 
 
 def flags_of_batch(flags: Tensor, tensordict: TensorDictBase) -> Tensor:
-    """Returns flags such as `done`, `[*B]` or `[*B, 1]`, as `[*B]`, the TensorDict's batch."""
+    """Returns flags such as `done`, `[*B]` or `[*B, 1]`, as `[*B]`, the TensorDict's batch size."""
     batch_dims = tensordict.ndim
     return flags.flatten(batch_dims).any(-1) if flags.ndim > batch_dims else flags
 
 
 @functools.cache
 def _compiled(compute: Callable[..., tuple[Tensor, ...]]) -> Callable[..., tuple[Tensor, ...]]:
-    """Returns a class's compiled `compute`, cached outside of instances to keep them picklable."""
+    """Returns a class's compiled `compute`, cached here so that instances can be pickled."""
     return torch.compile(compute, fullgraph=True)
 
 

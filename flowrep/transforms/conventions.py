@@ -1,6 +1,6 @@
-"""Conventions of simulators, by name: `sensors_from("isaac_lab", ...)` gives the adapters.
+"""Conventions of simulators, by name: `sensors_from("isaac_lab", ...)` returns the adapters.
 
-`CONVENTIONS` is the table. Each row says where its facts come from, and whether they were tried on
+`CONVENTIONS` is the table. Each row names the sources of its facts, and where they are tested on
 the simulator itself.
 """
 
@@ -25,33 +25,33 @@ from flowrep.transforms.motion import CameraMotion, InstanceMotion
 Options: TypeAlias = Mapping[str, Any]
 Layout: TypeAlias = Literal["hw", "hwc"]
 
-_PARTS = "adapted"  # keys under it are read by the next adapter only
+_PARTS = "adapted"  # only the next adapter reads the keys under it
 
 
 @dataclass(frozen=True, kw_only=True)
 class Convention:
-    """What a simulator gives: names of its buffers, and the options of their adapters.
+    """The names of a simulator's buffers, and the options of the adapters that convert them.
 
-    An option whose value is the name of an argument of `sensors_from` takes that argument's value.
+    If an option's value is the name of an argument of `sensors_from`, the argument replaces it.
 
     Args:
-        simulator: its name, and the version that the facts are of.
-        sources: where the simulator's makers say so.
-        tried: where it is tested on the simulator itself; empty if it is only tested on buffers
-            written as the sources say.
+        simulator: its name, and the version that has this convention.
+        sources: documentation or code of the simulator that states the convention.
+        tried: the file that tests it on the simulator; empty if it is only tested on buffers that
+            were written as the sources say.
         layout: of maps, `"hw"` or `"hwc"`.
         ids_layout: of ids, if it differs; of several channels, the first is read.
-        depth: options of `AdaptDepth` by buffer, the usual one first.
-        pose: buffers of the camera's pose, one or position and quaternion.
-        pose_options: of `AdaptPose`.
+        depth: options of `AdaptDepth` for each depth buffer, the usual buffer first.
+        pose: buffers of the camera's pose: one, or position and quaternion.
+        pose_options: of the camera's `AdaptPose`.
         bodies: buffers of the bodies' poses.
-        bodies_options: of their `AdaptPose`.
+        bodies_options: of the bodies' `AdaptPose`.
         ids: buffer of instance ids.
-        background: ids of what is no body.
-        flow: buffer of measured flow; empty if there is none, or its convention isn't known.
+        background: ids of pixels that show no body.
+        flow: buffer of the simulator's flow; empty if it has none or the convention is unknown.
         flow_options: of `AdaptFlow`.
-        K: where K comes from.
-        notes: what else has to be known.
+        K: how to get K.
+        notes: what else a user has to know.
     """
 
     simulator: str
@@ -323,18 +323,19 @@ def sensors_from(
     Args:
         simulator: a key of `CONVENTIONS`.
         depth: which of its depth buffers; by default the first.
-        body_ids: ids in the order of the rows of the bodies' poses; the convention's notes say of
-            what. Without them, the world is static, or flow is measured.
+        body_ids: ids in the order of the rows of the bodies' poses; the convention's notes say what
+            they identify. Leave them out if the world is static or flow is measured.
         static_ids: ids of bodies that stand still and need no pose.
-        flow: whether to read the simulator's own flow, if it has any whose convention is known.
+        flow: whether to read the simulator's flow, if it has any whose convention is known.
         intrinsics: K `[3, 3]` or its key, for depth along the rays.
-        near_m: the near plane, where depth is a z-buffer.
-        far_m: the far plane, where nothing drawn is there.
-        prefix: the key, or the first parts of it, of all buffers.
-        keys: keys of buffers that are elsewhere, by name.
+        near_m: the near plane, for depth from a z-buffer.
+        far_m: the far plane, for depth from a z-buffer, or the depth that stands for the sky.
+        prefix: the key under which all buffers are nested.
+        keys: the keys of buffers that are elsewhere, by the buffers' names.
 
     Raises:
-        ValueError: an unknown name, an argument that this simulator needs, or one that it doesn't.
+        ValueError: a name is unknown, an argument that the simulator needs is missing, or one is
+            given that it doesn't need.
 
     Example:
         >>> from torchrl.envs import Compose
@@ -348,11 +349,13 @@ def sensors_from(
     if simulator not in CONVENTIONS:
         raise ValueError(f"unknown simulator {simulator!r}; known are {', '.join(CONVENTIONS)}")
     row = CONVENTIONS[simulator]
+    if static_ids and body_ids is None:
+        raise ValueError("static_ids needs body_ids, the ids of the bodies that move")
     chosen = next(iter(row.depth)) if depth is None else depth
     if chosen not in row.depth:
         raise ValueError(f"{row.simulator} has no depth {chosen!r}; it has {', '.join(row.depth)}")
     if flow and not row.flow:
-        raise ValueError(f"{row.simulator} has no flow of a known convention: {row.notes}")
+        raise ValueError(f"{row.simulator} has no flow whose convention is known: {row.notes}")
     arguments: dict[str, Any] = {"intrinsics": intrinsics, "near_m": near_m, "far_m": far_m}
     options: dict[str, Any] = {}
     for name, value in row.depth[chosen].items():

@@ -17,24 +17,25 @@ from torchrl.data import TensorSpec, Unbounded
 
 from flowrep import geometry
 from flowrep.extras import require
-from flowrep.geometry.checks import check_name
+from flowrep.geometry.checks import check_name, checked_count
 from flowrep.transforms import base
 from flowrep.transforms.base import Keys, Reads
 from flowrep.transforms.flow import EGO_KEYS, FlowTransform, Intrinsics
 
 PICTURE_PAIR = Reads((6, "kH", "kW"), "integer")
 
-# An estimate of an object's flow counts where it leaves less than 0.9 of the pictures' squared
-# difference and gains more than rounding to grey levels can. At 0.7, false object flow above 0.3 px
-# was 8 % rarer, and people 8 to 20 m ahead lost 4 points more of theirs.
+# An estimate of an object's flow counts where it reduces the pictures' squared difference to less
+# than 0.9 of what ego flow leaves, and by more than rounding to grey levels could. With 0.7, false
+# object flow above 0.3 px was 8 % rarer, but people 8 to 20 m ahead lost another 4 percentage
+# points of their flow.
 _CLEARLY, _GREY_LEVELS = 0.9, 2.0
 
 # Takes two uint8 [N, 3, H, W], returns the flow from the first to the second, float [N, 2, H, W].
 Estimator = Callable[[Tensor, Tensor], Tensor]
 
-Preset = Literal["ultrafast", "fast", "medium", "fine"]  # the first three are OpenCV's 0, 1, 2
+Preset = Literal["ultrafast", "fast", "medium", "fine"]  # the first three are OpenCV's 0 to 2
 Network = Literal["raft_small", "raft_large"]
-SMALLEST_SIDE_PX = 128  # the network's coarsest correlation level has 1 / 64 of this
+SMALLEST_SIDE_PX = 128  # the network's coarsest correlation level, 1/64 of it, then has 2 px
 _MULTIPLE_PX = 8  # the network works at an eighth of the size
 
 
@@ -44,17 +45,17 @@ class DIS:
 
     Small pictures are enlarged by a whole factor and the flow is scaled back to their pixels: the
     preset "medium" matches patches of 8 px at half size, which is too coarse for a picture of 48
-    px. The faster presets choose their scale by the picture's width, and gain less or nothing by
-    it. "fine" is "medium" at the picture's full size with a tenth of the smoothing. People keep
-    more of their flow, at twice the cost.
+    px. The faster presets choose their scale by the picture's width, and gain little or nothing
+    from this. "fine" is "medium" at the picture's full size with a tenth of the smoothing. People
+    keep more of their flow, at twice the cost.
 
     A batch is split among as many threads as torch uses (`torch.set_num_threads`), as OpenCV
     releases Python's lock. Pictures on another device are copied to the CPU and their flow back,
     which waits for the device.
 
     Args:
-        preset: `"ultrafast"`, `"fast"` or `"medium"`, OpenCV's own, or `"fine"`.
-        min_side_px: pictures with a shorter side below this are enlarged to at least this; 1
+        preset: OpenCV's `"ultrafast"`, `"fast"` or `"medium"`, or `"fine"`.
+        min_side_px: pictures whose shorter side is below this are enlarged to at least this; 1
             enlarges none.
 
     Example:
@@ -68,8 +69,7 @@ class DIS:
 
     def __post_init__(self) -> None:
         check_name("preset", self.preset, Preset)
-        if self.min_side_px < 1:
-            raise ValueError(f"min_side_px must be at least 1, got {self.min_side_px}")
+        checked_count("min_side_px", self.min_side_px)
         _opencv()
 
     def __call__(self, first: Tensor, second: Tensor) -> Tensor:
@@ -126,12 +126,12 @@ class RAFT(nn.Module):
     """Recurrent all-pairs field transforms (Teed and Deng, 2020): flow by torchvision's network.
 
     It runs on the device of its weights. Small pictures are enlarged by a whole factor and the flow
-    is scaled back to their pixels. Sides that are no multiple of 8 are padded by repeating the
-    border, and the padding is cut off again. Where hardly anything moves it is noisier than DIS.
+    is scaled back to their pixels. Sides that aren't multiples of 8 are padded by repeating the
+    border, and the padding is cut off again. Where hardly anything moves, it is noisier than DIS.
 
     Args:
         weights: a file with the network's state dict, `.safetensors` or `.pth`, read without
-            unpickling objects. The weights published by torchvision fit.
+            unpickling objects, such as the weights that torchvision publishes.
         network: `"raft_small"` or `"raft_large"`, as the weights need.
         min_side_px: see `DIS`; at least 128.
 
@@ -148,11 +148,7 @@ class RAFT(nn.Module):
     ) -> None:
         super().__init__()
         check_name("network", network, Network)
-        if min_side_px < SMALLEST_SIDE_PX:
-            raise ValueError(
-                f"RAFT needs min_side_px of at least {SMALLEST_SIDE_PX}, got {min_side_px}"
-            )
-        self.min_side_px = int(min_side_px)
+        self.min_side_px = checked_count("min_side_px", min_side_px, SMALLEST_SIDE_PX)
         state = _read_weights(Path(weights))
         self.network = getattr(_optical_flow(), network)(weights=None)
         try:
@@ -239,8 +235,8 @@ class EstimatedFlow(FlowTransform):
     With `intrinsics` the camera's motion is compensated: the estimator sees the previous picture
     warped by ego flow, and its estimate, the objects' flow, is added to ego flow. Estimates are
     then small even if the camera moves fast. An estimate counts only where it explains the picture
-    clearly better than ego flow does, so that plain surfaces, the sky and what the previous picture
-    didn't show have ego flow alone.
+    clearly better than ego flow does. Plain surfaces, the sky and what the previous picture didn't
+    show thus have ego flow alone.
 
     Args:
         estimator: `"dis"`, `"raft_small"` or `"raft_large"` (which need `weights`), or a function
@@ -249,17 +245,17 @@ class EstimatedFlow(FlowTransform):
             three options are not for functions.
         weights: file with RAFT's weights, see `flowrep.transforms.RAFT`.
         preset: of DIS, see `flowrep.transforms.DIS`; RAFT doesn't read it.
-        min_side_px: pictures with a shorter side are enlarged; for RAFT to at least 128.
+        min_side_px: see `flowrep.transforms.DIS`; RAFT uses at least 128.
         intrinsics: K `[3, 3]` of the maps, or its key; see `RawFlow`, as for `prev_intrinsics`.
-            None leaves the pictures as they are.
-        picture_scale: k, size of the pictures in sizes of the maps.
+            None doesn't compensate the camera's motion.
+        picture_scale: k, the pictures' size over the maps'.
         outputs: which of `"raw"` and `"unscaled"` to write.
         scale: factor on raw; for `out_keys` see `RawFlow`.
         in_keys: the pair of pictures; with `intrinsics` also depth and the camera's motion.
 
     Raises:
-        ValueError: an option can't be used; in calls, pictures that are not `picture_scale` times
-            as large as the maps, or an estimator's flow of another shape.
+        ValueError: an option is invalid; in calls, the pictures aren't `picture_scale` times as
+            large as the maps, or the estimator's flow has the wrong shape.
 
     Example:
         A texture that moved 2 px to the right since the previous picture.
@@ -299,9 +295,7 @@ class EstimatedFlow(FlowTransform):
         options = (outputs, scales, False, prev_intrinsics)
         super().__init__(intrinsics, reads, keys, out_keys, *options)
         self.estimator = _estimator(estimator, weights, preset, min_side_px)
-        if picture_scale < 1:
-            raise ValueError(f"picture_scale must be at least 1, got {picture_scale}")
-        self.picture_scale = picture_scale
+        self.picture_scale = checked_count("picture_scale", picture_scale)
 
     def compute(self, pair: Tensor, *camera: Tensor) -> tuple[Tensor, ...]:
         """Returns the chosen outputs, from the pictures (and depth, camera motion and K)."""
@@ -334,7 +328,7 @@ class EstimatedFlow(FlowTransform):
         # - ego(p - e). Beyond ego(p), the pixel has therefore moved by e + ego(p - e) - ego(p).
         moved = _sources(estimate)
         beyond = estimate + _sampled(smooth, moved) - smooth
-        # Without texture, and where something comes into view, an estimate is a guess.
+        # Without texture, and where something has just come into view, an estimate is a guess.
         misfit = _misfit(current, _sampled(warped, moved))
         is_moving = misfit < _CLEARLY * _misfit(current, warped) - _GREY_LEVELS**2
         is_moving &= (sources.abs() <= 1).all(-1).unsqueeze(1)  # the previous picture showed it
@@ -345,7 +339,8 @@ class EstimatedFlow(FlowTransform):
     def _enlarged(self, ego: Tensor, seen: Tensor) -> Tensor:
         """Returns ego flow in the pictures' size and pixels; holes take their neighbours' flow.
 
-        It is interpolated, as an estimator would take steps of a whole pixel of the maps for flow.
+        It is interpolated: flow that is constant in each pixel of the maps would warp the picture
+        in steps, which an estimator takes for motion.
         """
         k = self.picture_scale
         flow, weight = (
@@ -365,8 +360,8 @@ class EstimatedFlow(FlowTransform):
         if flow.shape != expected:
             raise ValueError(
                 f"representation {self.label}: the estimator should return [N, 2, H, W], "
-                f"{[*expected]}, got {list(flow.shape)}; channels that come last, as "
-                "OpenCV's, are moved by flow.movedim(-1, 1)"
+                f"{[*expected]}, got {list(flow.shape)}; if channels come last, as OpenCV's do, "
+                "return flow.movedim(-1, 1)"
             )
         return -flow.to(torch.float32)
 
@@ -422,7 +417,7 @@ def _estimator(
             raise ValueError(f"estimator {estimator!r} needs weights=, a file with its state dict")
         return RAFT(weights, estimator, min_side_px=max(min_side_px, SMALLEST_SIDE_PX))
     if weights is not None:
-        raise ValueError(f"weights= are RAFT's; estimator {estimator!r} has none")
+        raise ValueError(f"weights= is for RAFT; estimator {estimator!r} has no weights")
     if not callable(estimator):
         check_name("estimator", estimator, Literal["dis", Network])
         return DIS(preset, min_side_px)

@@ -33,7 +33,7 @@ _DEPTH: NestedKey = ("sensor", "depth")
 _RAW_KEYS: Keys = [_DEPTH, ("sensor", "instance"), ("sensor", "instance_motion")]
 EGO_KEYS: list[NestedKey] = [_DEPTH, ("sensor", "prev_from_curr")]
 
-_CALLS_PER_LOOK = 100  # on a GPU, the values of K are looked at in one call of this many
+_CALLS_PER_LOOK = 100  # on a GPU, one call of this many checks the values of K
 _SAME_CAMERA = 1e-5  # share of fx by which K may differ: 0.01 px for a picture 1,000 px wide
 
 # K itself, or the key under which the env gives it.
@@ -41,18 +41,18 @@ Intrinsics: TypeAlias = Tensor | Sequence[Sequence[float]] | NestedKey
 
 
 class CameraTransform(MapTransform):
-    """A transform that needs the camera's K: given once, or read under a key of the TensorDict.
+    """A transform that needs the camera's K: a constant, or read under a key of the TensorDict.
 
-    A given K keeps its float type, even if the transform is cast to another. A key of K, `[*B, 3,
-    3]`, is read after all other keys, and that of the previous frame's K last. Raw flow, where it
-    is the first input, becomes nan where the mask under `mask_key` is False.
+    A constant K keeps its float type, even if the transform is cast to another. If K is read, the
+    last input keys are that of K, `[*B, 3, 3]`, and, if given, that of the previous frame's K. If
+    the first input is raw flow, it becomes nan where the mask under `mask_key` is False.
 
-    Values of K are checked when they change; on a GPU, where reading them waits, in one call of a
-    hundred. A K that isn't known (nan, inf, no focal length) makes its frame invalid.
+    Values of K are checked when they change; on a GPU, where the check has to wait for them, in one
+    call of a hundred. An unknown K (nan, inf or a focal length of 0) makes its frame invalid.
 
     Raises:
-        ValueError: no camera of these maps has this K, see `check_intrinsics`; or K changes within
-            an episode and the previous frame's K has no key.
+        ValueError: K doesn't fit the maps' size, see `check_intrinsics`; or K changes within an
+            episode and no key gives the previous frame's K.
     """
 
     K: Tensor | None
@@ -96,7 +96,7 @@ class CameraTransform(MapTransform):
         return maps
 
     def _check_cameras(self, maps: Sequence[Tensor | TensorSpec]) -> None:
-        """Raises ValueError for a K that no camera of these maps has, where it is a new one."""
+        """Raises ValueError if K doesn't fit the maps; skips a K that was checked already."""
         size = _map_size(maps, self.reads)
         if self.K is not None and ("K" not in self._checked or self._checked["K"][0] != size):
             geometry.check_intrinsics("intrinsics", self.K, size)
@@ -113,7 +113,8 @@ class CameraTransform(MapTransform):
         """Returns whether to read K's values now, which waits for a GPU."""
         if torch.compiler.is_compiling() or K.is_meta:
             return False
-        return K.is_cpu or self._calls % _CALLS_PER_LOOK < 2  # at the first reset and call, too
+        # 0 is the first reset, 1 the first step.
+        return K.is_cpu or self._calls % _CALLS_PER_LOOK < 2
 
     def _check_one_camera(
         self, before: Tensor | None, now: Tensor | None, done: Callable[[], Tensor | None]
@@ -121,7 +122,7 @@ class CameraTransform(MapTransform):
         """Raises ValueError if K changes from frame to frame where no episode is `done`."""
         if before is None or now is None or not self._looks_at(now) or torch.equal(before, now):
             return
-        # By more than rounding. What isn't known (nan) compares False.
+        # By more than rounding. An unknown K (nan) compares False.
         changes = (now - before).abs().amax((-2, -1)) > _SAME_CAMERA * now[..., 0, 0].abs()
         if (ended := done()) is not None:
             changes &= ~expand_as_right(ended, changes)
@@ -129,8 +130,8 @@ class CameraTransform(MapTransform):
             where, index = first_wrong(f"key {self.camera_keys[0]!r}", changes)
             raise ValueError(
                 f"{where} changes within an episode, from {before[index].tolist()} to "
-                f"{now[index].tolist()}, and flow depends on both: give the previous frame's K a "
-                "key, prev_intrinsics=, which the transform PreviousIntrinsics can write"
+                f"{now[index].tolist()}, and flow depends on both: give the key of the previous "
+                "frame's K, prev_intrinsics=, which the transform PreviousIntrinsics writes"
             )
 
     @property
@@ -143,7 +144,7 @@ class CameraTransform(MapTransform):
             before, now = (
                 td.get(self.camera_keys[0], None) for td in (tensordict, next_tensordict)
             )
-            # An env with autoreset returns the next episode's first frame where this one is done.
+            # Where an episode is done, an env with autoreset returns the next one's first frame.
             self._check_one_camera(before, now, lambda: _ended(next_tensordict, "done"))
         return super()._step(tensordict, next_tensordict)
 
@@ -171,7 +172,7 @@ class CameraTransform(MapTransform):
         like = maps[0][..., :1, :, :]
         if known.dtype != torch.bool or known.shape != like.shape:
             raise ValueError(
-                f"representation {self.label}: key {key!r}, where {self.in_keys[0]!r} is known, "
+                f"representation {self.label}: key {key!r}, the mask of {self.in_keys[0]!r}, "
                 f"should be bool {list(like.shape)}; got {known.dtype} {list(known.shape)}"
             )
         return [torch.where(known, maps[0], math.nan), *maps[1:]]
@@ -188,8 +189,8 @@ class CameraTransform(MapTransform):
 class FlowTransform(CameraTransform):
     """Base of the flow transforms: K, the chosen outputs, and their scale.
 
-    A subclass names the outputs that it can write (`known`), and those of them that get a mask
-    beside them, under `mask_key` (`masked`). For the arguments see `RawFlow`.
+    A subclass names the outputs that it can write (`known`), and those of them that come with a
+    mask under `mask_key` (`masked`). For the arguments see `RawFlow`.
     """
 
     known: tuple[str, ...]
@@ -219,7 +220,7 @@ class FlowTransform(CameraTransform):
         self.compiled = bool(compiled)
 
     def _at_one_precision(self, maps: Sequence[Tensor]) -> list[Any]:
-        """Returns the inputs, K and the previous K or None, in depth's type, at least float32."""
+        """Returns the inputs, K, and the previous K or None, in depth's type, at least float32."""
         # Raw and ego flow have to round alike, or obj is rounding noise on static pixels.
         (depth,) = (x for x, reads in zip(maps, self.reads) if reads == base.DEPTH)
         dtype = torch.promote_types(depth.dtype, torch.float32)
@@ -270,21 +271,23 @@ class RawFlow(FlowTransform):
         intrinsics: K `[3, 3]` of the maps, a tensor or nested lists, pixels; or the env's key for
             it, `[*B, 3, 3]`.
         prev_intrinsics: key of the previous frame's K, for cameras that zoom or focus, see
-            `PreviousIntrinsics`; K needs a key then. Without it, a K that changes within an episode
-            raises ValueError. (A replay sample of single frames doesn't show that it changes.)
+            `PreviousIntrinsics`; `intrinsics` has to be a key then. Without it, a K that changes
+            within an episode raises ValueError. (In a replay sample of single frames, such a change
+            is not visible.)
         outputs: which of `"raw"` and `"valid"` to write.
         scale: factor on the flow, finite and not 0; the frame rate gives pixels per second.
         compiled: whether `compute` runs through `torch.compile`, which is about five times as fast
-            on a CPU and equal up to rounding. Compiling takes up to a minute; later processes find
-            the result in torch's cache. Otherwise numba, if it is installed, computes large float32
-            batches on a CPU two to five times as fast as PyTorch, with the same bits.
+            on a CPU and equal up to rounding. Compiling takes up to a minute; later processes take
+            the result from torch's cache. If False, and numba is installed, large float32 batches
+            on a CPU are computed by numba, two to five times as fast as by PyTorch and bit for bit
+            the same.
         in_keys: depth, instance ids, and one motion for each instance.
-        out_keys: one key for each output; their names by default. The mask's key follows raw's:
-            `("sensor", "flow_valid")` for `("sensor", "flow")`.
+        out_keys: one key for each output; their names by default. The mask's key is raw's with
+            `_valid` appended: `("sensor", "flow_valid")` for `("sensor", "flow")`.
 
     Raises:
-        ValueError: an option can't be used, K is no camera's, or `compiled=True` without a C++
-            compiler. In calls, see `check_intrinsics` and `prev_intrinsics`.
+        ValueError: an option or K is invalid, or `compiled=True` without a C++ compiler. In calls,
+            see `check_intrinsics` and `prev_intrinsics`.
         RuntimeError: in calls, for an id without a row of `instance_motion`.
 
     Example:
@@ -329,7 +332,7 @@ class RawFlow(FlowTransform):
         return self._chosen({"raw": flow}, valid)
 
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
-        """Returns the outputs' specs; ids that say how many they are must be one per motion."""
+        """Returns the outputs' specs; ValueError if ids' spec has another number than motions'."""
         _, ids, motions, *_ = specs
         if isinstance(ids, Categorical) and ids.n != motions.shape[-3]:
             raise ValueError(
@@ -355,9 +358,9 @@ class FlowFactorize(FlowTransform):
     channels; see `flowrep.geometry.factorize`. With the simulator's raw flow, obj is exactly 0 on
     everything static.
 
-    Raw flow isn't known where the mask beside it is False, bool `"raw_valid"`, whose key follows
-    raw's. `RawFlow` and `EstimatedFlow` write it, and whoever stores raw flow has to store both.
-    Where ego or raw flow isn't known, obj is 0 and `"valid"` False.
+    Raw flow is unknown where its mask, bool under raw's key with `_valid` appended, is False.
+    `RawFlow` and `EstimatedFlow` write the mask; a buffer that stores raw flow has to store it,
+    too. Where ego or raw flow is unknown, obj is 0 and `"valid"` False.
 
     Args:
         intrinsics: K `[3, 3]` of the maps, or its key; see `RawFlow`, as for `prev_intrinsics`.
@@ -365,12 +368,12 @@ class FlowFactorize(FlowTransform):
             finite) and `"valid"` to write. For ego alone, raw flow isn't read.
         scale: factor on the flows, or a mapping from output to factor.
         compiled: see `RawFlow`.
-        in_keys: raw flow (in px/step, unscaled), depth and camera motion; without raw flow for ego
-            alone.
+        in_keys: raw flow (in px/step, unscaled), depth and camera motion; for ego alone, only the
+            last two.
         out_keys: one key for each output; their names by default.
 
     Raises:
-        ValueError: as `RawFlow` does.
+        ValueError: see `RawFlow`.
 
     Example:
         The camera moved 0.1 m to the right, so a wall a metre away moves by fx · 0.1 = 3 px to the
@@ -426,7 +429,7 @@ def _is_equal(a: Tensor, b: Tensor) -> bool:
 
 
 def _ended(tensordict: TensorDictBase, key: NestedKey) -> Tensor | None:
-    """Returns where an episode is over, bool `[*B]`, or None if the TensorDict doesn't say."""
+    """Returns where an episode is over, bool `[*B]`, or None if the TensorDict has no such key."""
     done = tensordict.get(key, None)
     return None if done is None else flags_of_batch(done, tensordict)
 
@@ -456,12 +459,12 @@ def _scales(scale: float | Mapping[str, float], flows: Sequence[str]) -> dict[st
 
 
 def as_intrinsics(intrinsics: Tensor | Sequence[Sequence[float]]) -> Tensor:
-    """Returns K as a float tensor `[3, 3]`; raises ValueError if it is none."""
+    """Returns K as a float tensor `[3, 3]`; raises ValueError if it isn't one."""
     K = torch.as_tensor(intrinsics)
     K = K.clone() if K.is_floating_point() else K.to(torch.get_default_dtype())
     if K.shape != (3, 3):
         raise ValueError(
-            f"intrinsics is K, [3, 3], or the key of [*B, 3, 3] in the TensorDict; got "
+            "intrinsics is K, [3, 3], or the key of K, [*B, 3, 3], in the TensorDict; got "
             f"{list(K.shape)}"
         )
     geometry.check_intrinsics("intrinsics", K)

@@ -9,7 +9,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
 
-from flowrep.transforms.base import Keys, Reads, RecurrentTransform, check_own_keys
+from flowrep.geometry.checks import checked_count
+from flowrep.transforms.base import Keys, Reads, RecurrentTransform, check_distinct_keys
 
 
 class FrameStack(RecurrentTransform):
@@ -22,8 +23,8 @@ class FrameStack(RecurrentTransform):
     After a reset all k frames are the episode's first. The previous step's stack is read from the
     TensorDict passed to `step`, where the env declares it as part of its state, as TorchRL's
     `StepCounter` does. No state is kept between calls, so stacks can't mix episodes or envs.
-    (TorchRL's `CatFrames` keeps state. In a replay buffer it stacks neighbours in a sample, which
-    is wrong if samples are shuffled.)
+    (TorchRL's `CatFrames` keeps state. In a replay buffer it stacks neighbours of a sample, which
+    is wrong for shuffled samples.)
 
     In a replay buffer, the stack stored at the root and the next frame give the next stack exactly,
     in shuffled samples too. Without `("next", out_key)`, a transition takes k + 1 frames instead of
@@ -59,10 +60,8 @@ class FrameStack(RecurrentTransform):
         maps = len(in_keys) if isinstance(in_keys, list) else 1
         reads = [Reads((f"C{i}", f"H{i}", f"W{i}")) for i in range(maps)]
         super().__init__(reads, in_keys, out_keys, writes=maps)
-        check_own_keys(self)
-        if k < 1:
-            raise ValueError(f"k, the number of frames, must be at least 1; got {k}")
-        self.k = int(k)
+        check_distinct_keys(self)
+        self.k = checked_count("k", k)
 
     @property
     def carried_keys(self) -> list[NestedKey]:

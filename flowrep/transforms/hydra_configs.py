@@ -15,7 +15,7 @@ stack: {transforms: ["${raw}", "${split}"]}
 ```
 
 As in TorchRL's configs, a nested key is a list within the list of keys: `in_keys: [[a, b]]` is one
-key, `in_keys: [a, b]` are two. Names and defaults come from the signatures of the classes.
+key, `in_keys: [a, b]` are two. Argument names and defaults are those of the constructors.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ from flowrep.transforms.base import as_keys
 
 
 def config_of(transform: type[Transform]) -> dict[str, Any]:
-    """Returns a transform's class and arguments; one without a default is `???`, to be given."""
-    # TorchRL's metaclass hides the constructor's signature
+    """Returns a transform's class and arguments; one without a default is `???`, mandatory."""
+    # TorchRL's metaclass hides the signature of the constructor.
     parameters = inspect.signature(transform.__init__).parameters
     arguments = {name: _plain(name, p.default) for name, p in parameters.items() if name != "self"}
-    # lists and mappings reach the transform as Python's own types, not as OmegaConf's
+    # The transform gets lists and mappings as Python's types, not as OmegaConf's.
     target = {"_target_": f"{transform.__module__}.{transform.__qualname__}", "_convert_": "all"}
     return target | arguments
 
@@ -55,9 +55,9 @@ def _plain(name: str, default: Any) -> Any:
     return [*default] if isinstance(default, tuple) else default
 
 
-importlib.import_module("torchrl.trainers.algorithms.configs")  # which registers TorchRL's
+importlib.import_module("torchrl.trainers.algorithms.configs")  # registers TorchRL's
 CONFIGS: dict[str, dict[str, Any]] = {}
-"""By name in the group `transform`: `raw_flow` for `RawFlow`."""
+"""The configs by their names in the group `transform`: `raw_flow` for `RawFlow`."""
 
 for _name in transforms.__all__:
     _class = getattr(transforms, _name)

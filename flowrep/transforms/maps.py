@@ -1,7 +1,4 @@
-"""Transforms of a single map: picture, segmentation, depth, and instance ids.
-
-By default, `in_keys` and `out_keys` are those in each transform's table.
-"""
+"""Transforms of a single map: picture, segmentation, depth, and instance ids."""
 
 from __future__ import annotations
 
@@ -16,14 +13,14 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, TensorSpec
 
 from flowrep import geometry
-from flowrep.geometry.checks import check_name
-from flowrep.transforms.base import DEPTH, IDS, RGB, Keys, MapTransform, check_own_keys
+from flowrep.geometry.checks import check_name, checked_count
+from flowrep.transforms.base import DEPTH, IDS, RGB, Keys, MapTransform, check_distinct_keys
 
 Encoding = Literal["ids", "onehot"]
 
 _LINK_BIT = 24  # PyBullet's ids: body + (link + 1 << 24)
-# How often ids without a row are looked for, on a GPU or once a warning named some: the search
-# takes a pass over the ids, and waits for a GPU.
+# On a GPU, and everywhere after the first warning, one call of this many searches for ids without a
+# row: the search is another pass over the ids, and waits for a GPU.
 _CALLS_PER_LOOK = 100
 
 
@@ -66,7 +63,7 @@ class Segmentation(MapTransform):
 
     In a replay buffer, ids take an eighth of the memory of a one-hot float map of two classes.
     Their spec is a `Categorical` with n, so that a network can expand them. An id outside 0 … n − 1
-    is a pixel without a class, all zeros in the one-hot encoding.
+    marks a pixel without a class, whose one-hot encoding is all zeros.
 
     Ids of a wider or signed type are checked in each call before they are converted to uint8. The
     check waits for a GPU; pass uint8 to avoid it.
@@ -98,9 +95,8 @@ class Segmentation(MapTransform):
     ) -> None:
         super().__init__([IDS], in_keys, out_keys)
         check_name("encoding", encoding, Encoding)
-        if not 1 <= num_classes <= 256:
-            raise ValueError(f"num_classes must be 1 to 256 (ids are uint8), got {num_classes}")
-        self.num_classes, self.encoding = int(num_classes), encoding
+        self.num_classes = checked_count("num_classes", num_classes, most=256)  # ids are uint8
+        self.encoding = encoding
 
     def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
         (ids,) = super()._read(tensordict)
@@ -109,8 +105,8 @@ class Segmentation(MapTransform):
             least, most = (int(bound) for bound in ids.aminmax())
             if least < 0 or most > 255:
                 raise ValueError(
-                    f"{self.in_keys[0]!r} holds class ids from {least} to {most}, but uint8 only "
-                    "ids from 0 to 255; give pixels without a class an id in that range, e.g. "
+                    f"{self.in_keys[0]!r} holds class ids from {least} to {most}, but uint8 can "
+                    "hold only 0 to 255; give pixels without a class an id in that range, e.g. "
                     "ids.where((ids >= 0) & (ids < num_classes), 255), or use encoding='onehot'"
                 )
         return [ids]
@@ -186,24 +182,24 @@ class InstanceIds(MapTransform):
     | --- | --- | --- | --- | --- |
     | ids | `("sensor", "instance")` | uint8 `[*B, 1, H, W]` (int32 from 256 bodies) | 0 … N | row |
 
-    Ids that have no row become 0, the static world. A warning names each of them once, with its
-    share of the pixels, unless it is negative (a background) or one of `static_ids`. Every call
-    looks for such ids until the first warning; then, and on a GPU always, one call in a hundred.
+    Ids without a row become 0, the static world. A warning names each of them once, with its share
+    of the pixels, unless it is negative (a background) or one of `static_ids`. Every call searches
+    for such ids until the first warning; after it, and always on a GPU, one call in a hundred does.
 
-    PyBullet's ids with links (`ER_SEGMENTATION_MASK_OBJECT_AND_LINKINDEX`) hold a body's id and,
-    from bit 24 on, 1 + its link's. Name bodies as (body, link) then, each with the pose of its
-    link, -1 for the base.
+    PyBullet's ids with links (`ER_SEGMENTATION_MASK_OBJECT_AND_LINKINDEX`) hold the body's id in
+    the low 24 bits and 1 + the link's index above them. For these, `body_ids` lists (body, link)
+    pairs, in the order of the links' poses; the base is link -1.
 
     Args:
-        body_ids: the ids of the bodies, or (body, link), in the order of their poses: the first
-            becomes 1.
-        static_ids: ids of what stands still, such as the floor's.
-        links_as_body: whether links of PyBullet that `body_ids` lacks take their body's row.
+        body_ids: the ids of the bodies, or (body, link) pairs, in the order of their poses: the
+            first becomes 1.
+        static_ids: ids of what stands still, such as the floor.
+        links_as_body: whether PyBullet's links that `body_ids` lacks get their body's row.
         out_keys: must differ from `in_keys`, so that nothing is converted twice.
 
     Raises:
-        ValueError: `body_ids` names a body twice; or, in calls, the picture has PyBullet's ids with
-            links, `body_ids` has their bodies without links, and `links_as_body` is False.
+        ValueError: `body_ids` lists a body twice; or, in calls, the ids are PyBullet's with links,
+            `body_ids` lists bodies without links, and `links_as_body` is False.
 
     Example:
         >>> from tensordict import TensorDict
@@ -225,10 +221,10 @@ class InstanceIds(MapTransform):
         out_keys: Keys = ("sensor", "instance"),
     ) -> None:
         super().__init__([IDS], in_keys, out_keys)
-        check_own_keys(self)
+        check_distinct_keys(self)
         packed = [_packed(*x) if isinstance(x, (tuple, list)) else int(x) for x in body_ids]
         if len(set(packed)) != len(packed):
-            raise ValueError(f"body_ids must name each body once, got {list(body_ids)}")
+            raise ValueError(f"body_ids must list each body once, got {list(body_ids)}")
         ids = torch.tensor(packed, dtype=torch.long)
         self.register_buffer("body_ids", ids, persistent=False)
         self.links_as_body = bool(links_as_body)
@@ -267,15 +263,15 @@ class InstanceIds(MapTransform):
             links = [n for n in numbers if n >> _LINK_BIT and n % (1 << _LINK_BIT) in bodies]
             if links:
                 raise ValueError(
-                    f"{self.in_keys[0]!r} holds PyBullet's ids with links, {_named(links[0])} for "
-                    "instance, and body_ids has bodies without links: name those that have a pose "
-                    "of their own as (body, link), -1 for the base, or set links_as_body=True"
+                    f"{self.in_keys[0]!r} holds PyBullet's ids with links, for instance "
+                    f"{_named(links[0])}, but body_ids lists bodies without links: list (body, "
+                    "link) for each link with a pose, -1 for the base, or set links_as_body=True"
                 )
         shares = [f"{_named(n)} ({count / ids.numel():.1%})" for n, count in zip(numbers, counts)]
         warnings.warn(
             f"{self.in_keys[0]!r}: ids without a row count as the static world: "
             f"{', '.join(shares[:8])} of the pixels{', ...' * (len(shares) > 8)}. If they move, "
-            "body_ids needs them; if not, name them in static_ids",
+            "add them to body_ids; if not, to static_ids",
             stacklevel=2,
         )
         self._static |= set(numbers)
@@ -294,8 +290,8 @@ def _packed(body: int, link: int) -> int:
 
 
 def _body_of(ids: Tensor) -> Tensor:
-    """Returns the bodies' ids of PyBullet's ids with links; negative ids stay."""
-    # Types of one or two bytes hold no links.
+    """Returns the bodies' ids, from PyBullet's ids with links; negative ids are kept."""
+    # Integers of one or two bytes can't hold links.
     return torch.where(ids < 0, ids, ids % (1 << _LINK_BIT)) if ids.element_size() > 2 else ids
 
 

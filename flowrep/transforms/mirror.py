@@ -20,10 +20,10 @@ Images = Literal["half", "both", "all"]
 class Mirror(Transform):
     """Left-right images of the transitions that a replay buffer samples.
 
-    In a street that might as well be its mirror image, whatever holds for a left turn holds for a
-    right turn. A transition's image has the columns of its maps reversed, at the root and under
-    `"next"`, the horizontal component of its flows negated, and its action exchanged. Reward and
-    done flags stay the same.
+    In a street whose mirror image is as likely, what holds for a left turn holds for a right turn.
+    In a transition's image, the columns of the maps are reversed, at the root and under `"next"`,
+    the horizontal component of flows is negated, and the action is exchanged. Reward and done flags
+    stay the same.
 
     | reads and writes | shape | its image |
     | --- | --- | --- |
@@ -32,19 +32,19 @@ class Mirror(Transform):
     | `"action"` | `[*B]` or one-hot `[*B, n]` | `swapped_actions[action]` |
 
     Convention: pixel (0, 0)'s centre is (0.5, 0.5), so that column i sees x / z = (i + 0.5 - cx) /
-    fx, and the column that sees the opposite is 2·cx - 1 - i. With cx = W / 2 the first column
-    becomes the last. flowrep's simulated camera samples a pixel at its left edge, cx = W / 2 + 0.5:
-    column i becomes W - i, and column 0 would be one beyond the picture. Such columns, |2·cx - W|
-    of them at one border, take the nearest column that was seen; the others are exact.
+    fx, and column 2·cx - 1 - i sees the opposite. With cx = W / 2, the first column becomes the
+    last. flowrep's simulated camera samples a pixel at its left edge, cx = W / 2 + 0.5: column i
+    becomes W - i, and the image of column 0 would need column W, which doesn't exist. Such columns,
+    |2·cx - W| of them at one border, take the nearest column that was seen; the others are exact.
 
     It keeps no state and overwrites what it reads. It is for replay buffers: in an env, actions
     would have to be exchanged before they are taken.
 
     Args:
         in_keys: all maps to mirror.
-        flow_keys: those of them that are flows; None for none.
-        swapped_actions: for each action the one that does the same in the mirror, such as
-            `[0, 2, 1]` for (straight on, left, right).
+        flow_keys: those of `in_keys` that are flows.
+        swapped_actions: for each action, its mirror image, such as `[0, 2, 1]` for (straight on,
+            left, right).
         intrinsics: K `[3, 3]` of the maps, without skew; None if it is centred, cx = W / 2. 2·cx
             has to be whole, since class ids can't be interpolated.
         images: "half" replaces each transition with probability 1/2, a trajectory (with a dimension
@@ -52,8 +52,8 @@ class Mirror(Transform):
             doubles it; "all" replaces all.
 
     Raises:
-        ValueError: `flow_keys` holds a key that `in_keys` lacks, `swapped_actions` is no exchange,
-            or K has skew or a cx between columns.
+        ValueError: `flow_keys` holds a key that `in_keys` lacks, `swapped_actions` doesn't exchange
+            actions in pairs, K has skew, or 2·cx isn't whole.
         RuntimeError: it is used in an env.
 
     Example:
@@ -152,7 +152,7 @@ def _twice_cx(intrinsics: Any) -> int:
     twice_cx = round(2 * K[0, 2].item())
     if abs(2 * K[0, 2].item() - twice_cx) > 1e-3:
         raise ValueError(
-            f"the camera's cx is {K[0, 2].item():g}, so that columns would have to be "
-            "interpolated; Mirror needs 2·cx whole"
+            f"the camera's cx is {K[0, 2].item():g}, so columns would have to be interpolated; "
+            "Mirror needs a whole 2·cx"
         )
     return twice_cx

@@ -162,8 +162,9 @@ class EstimateCameraMotion(CameraTransform):
     | `"raw_valid"`, if there | | | |
 
     Convention, and where it fails: see `flowrep.geometry.camera_motion`. The result depends on the
-    frame alone, so it is the same in an env, in any batch and on replay samples. A frame from which
-    no motion can be estimated (`motion_valid` False) has the prior, or the identity without one.
+    frame alone, so it is the same in an env, in any batch and on replay samples. If no motion can
+    be estimated from a frame, `motion_valid` is False and the motion is the prior's or, without
+    one, the identity.
 
     Put it after the transform that writes raw flow and before `FlowFactorize`, whose ego and object
     flow then need no pose.
@@ -172,7 +173,7 @@ class EstimateCameraMotion(CameraTransform):
         intrinsics: K `[3, 3]` of the maps, pixels, or the env's key for it, `[*B, 3, 3]`; see
             `RawFlow`, as for `prev_intrinsics`.
         picture: key of the current picture, uint8 `[*B, 3, kH, kW]`, k ≥ 1. Give it if raw flow is
-            estimated: flow on plain surfaces, and along edges, then doesn't count.
+            estimated: flow on plain surfaces and along edges, which is a guess, is then ignored.
         prior: key of the expected motion, `[*B, 4, 4]`, such as odometry's.
         outputs: which of `"motion"`, `"inlier_share"`, `"covariance"` and `"valid"` to write.
         in_keys: raw flow (px/step, unscaled) and depth.
@@ -212,20 +213,19 @@ class EstimateCameraMotion(CameraTransform):
             if key is not None:
                 reads.append(layout)
                 keys += as_keys([key])
-        own_keys: Keys = [_ESTIMATES[name] for name in outputs]
-        written = own_keys if out_keys is None else out_keys
+        written = [_ESTIMATES[name] for name in outputs] if out_keys is None else out_keys
         super().__init__(intrinsics, reads, keys, written, len(outputs), prev_intrinsics)
         self.outputs = tuple(outputs)
         self.has_picture, self.has_prior = picture is not None, prior is not None
 
     def compute(self, raw: Tensor, depth: Tensor, *more: Tensor) -> tuple[Tensor, ...]:
         """Returns the chosen outputs."""
-        # In the order of the keys: picture, prior, K, previous K, each if there is one.
+        # In the keys' order: picture, prior, K and previous K, those that there are.
         rest = list(more)
         picture = rest.pop(0) if self.has_picture else None
         if picture is not None:
             k, size = picture.shape[-1] // depth.shape[-1], depth.shape[-2:]
-            # Other sizes are left as they are, for `camera_motion` to refuse.
+            # `camera_motion` refuses pictures of other sizes.
             if k > 1 and picture.shape[-2:] == (k * size[0], k * size[1]):
                 flat = picture.reshape(-1, *picture.shape[-3:]).float()
                 picture = functional.avg_pool2d(flat, k).reshape(*picture.shape[:-2], *size)

@@ -13,6 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 
+from flowrep.geometry.checks import checked_count
 from flowrep.geometry.pose import rotation_from_vector
 from flowrep.transforms import base
 from flowrep.transforms.base import Keys, MapTransform, Reads, as_keys, check_choice
@@ -32,11 +33,12 @@ NOISY_SENSORS = {
     "flow": _Sensor(base.FLOW, "raw", ("flow_sigma_px",)),
 }
 
-# SplitMix64's constants as signed integers, torch's only 64-bit type; products wrap around.
+# SplitMix64's constants as signed integers, since torch has no arithmetic on uint64; products wrap
+# around as they should.
 _GAMMA, _FIRST, _SECOND = (
     number - (1 << 64) for number in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
 )
-_DIGITS = 24  # bits of a float32's fraction; `normal` and `uniform` use 24 of the 64 bits each
+_DIGITS = 24  # bits of a float32's significand; `normal` and `uniform` use 24 of the 64 bits each
 
 
 class SensorNoise(MapTransform):
@@ -49,14 +51,14 @@ class SensorNoise(MapTransform):
     | `"raw"` if chosen | the same, noisy | float `[*B, 2, H, W]` | any | px/step |
     | `frame_key` if given | | integer `[*B, F]` | | |
 
-    Convention: depth z gets a normal error of standard deviation `depth_sigma_per_m` · z², as that
-    of stereo and structured light. Depth that would not be in front of the camera becomes a hole
-    (`nan`), and so does each pixel with probability `depth_dropout`. Camera motion is followed by a
-    small rigid motion of the current camera, so that integrated poses drift as odometry does. A
-    sensor with all of its options at 0 passes through bitwise unchanged.
+    Convention: depth z gets a normal error of standard deviation `depth_sigma_per_m` · z², as with
+    stereo and structured light. Depth that is no longer positive becomes a hole (`nan`), and so
+    does each pixel with probability `depth_dropout`. Camera motion is followed by a small rigid
+    motion of the current camera, so that integrated poses drift as odometry does. A sensor with all
+    of its options at 0 passes through bitwise unchanged.
 
     Put it into the env, after `RawFlow` and before `FlowFactorize`, so that stored samples hold
-    what the agent saw. Frames at resets get noise like all others.
+    what the agent saw. The frames of resets get noise like all others.
 
     With `frame_key`, noise is a function of the integers that identify a frame, e.g. episode and
     step. A frame gets the same noise in any batch, order, process or session, at the root and under
@@ -76,7 +78,7 @@ class SensorNoise(MapTransform):
         flow_sigma_px: standard deviation of each flow channel, pixels per step.
         seed: of the generator; envs with the same seed have the same noise. None derives it from
             torch's global generator (`torch.manual_seed` makes it reproducible) and the name of
-            the worker process; with `frame_key` it is 0.
+            the worker process; with `frame_key`, None is 0.
         frame_key: key of the integers that identify the frame, such as StreetEnv's
             `("sensor", "frame")`.
         in_keys: one key for each sensor; the table's by default.
@@ -128,7 +130,7 @@ class SensorNoise(MapTransform):
             writes=len(sensors),
         )
         self.sensors, self.options = tuple(sensors), options
-        self.seed = None if seed is None else int(seed)
+        self.seed = None if seed is None else checked_count("seed", seed, 0)
         self.has_frames = bool(frame)
         self._state: Tensor | None = None  # of the generator, after what has been drawn
 
@@ -159,8 +161,8 @@ class SensorNoise(MapTransform):
             stream = list(NOISY_SENSORS).index(sensor)
             bits = frame_bits(frame, shape, seed=self.seed or 0, stream=stream)
             return normal(bits), uniform(bits) if sensor == "depth" else uniforms
-        # A new generator in each call, and its state is replaced, never changed in place: copies of
-        # the transform, TorchRL's shallow clones among them, then draw independently.
+        # Each call makes a new generator and replaces the state, never changes it in place: copies
+        # of the transform, TorchRL's shallow clones among them, then draw independently.
         generator = torch.Generator(device)
         if self._state is None:
             generator.manual_seed(_drawn_seed() if self.seed is None else self.seed)
@@ -235,10 +237,7 @@ def _check_options(sensors: Sequence[str], options: dict[str, float]) -> None:
 
 
 def split_mix(state: Tensor) -> Tensor:
-    """Returns the number that SplitMix64 generates from each state, int64.
-
-    With the constants of Steele, Lea and Flood (2014).
-    """
+    """Returns what SplitMix64 (Steele, Lea and Flood, 2014) generates from each state, int64."""
     z = state + _GAMMA
     for bits, factor in ((30, _FIRST), (27, _SECOND)):
         z ^= _shifted(z, bits)
@@ -248,9 +247,9 @@ def split_mix(state: Tensor) -> Tensor:
 
 
 def frame_bits(frame: Tensor, shape: Sequence[int], *, seed: int, stream: int) -> Tensor:
-    """Returns 64 random bits for each element, `[*B, *shape]`, of frames `[*B, N]`, int64.
+    """Returns 64 random bits for each element, int64 `[*B, *shape]`, of frames `[*B, N]`.
 
-    A frame is identified by N integers; `stream`, a small number, separates its sensors.
+    N integers identify a frame; `stream`, a small number, distinguishes its sensors.
     """
     start = torch.full_like(frame[..., 0], seed, dtype=torch.int64)
     for number in (torch.full_like(start, stream), *frame.long().unbind(-1)):

@@ -25,7 +25,7 @@ Options = dict[str, Any]
 _SOURCES = ("exact", "estimated")
 _FLOW_OPTIONS = ("scale",)
 _ESTIMATOR_OPTIONS = ("estimator", "weights", "preset", "min_side_px", "picture_scale")
-# The transform of each representation, and which of its parameters a user may set.
+# Each representation's transform, and the parameters of it that a user may set.
 _OPTIONS: dict[str, tuple[type[Transform], tuple[str, ...]]] = {
     "rgb": (Rgb, ()),
     "seg": (Segmentation, ("encoding",)),
@@ -41,7 +41,7 @@ REPRESENTATIONS: tuple[str, ...] = (*_OPTIONS, *_FRAMES_OF)
 
 _UNSCALED_KEY = "_raw"  # exact raw flow in px/step, for FlowFactorize
 _PICTURE_KEY = ("sensor", "rgb")
-# Measurements, and what the next step needs, stay in the TensorDict.
+# These stay in the TensorDict: the next step needs the pictures, the others are measurements.
 _PICTURES_KEY = "_rgb2"
 _ESTIMATED_FLOW_KEY = ("sensor", "flow")  # in px/step
 _ESTIMATED_MOTION_KEY = ("sensor", "estimated_motion")
@@ -80,34 +80,34 @@ def representation_stack(
 
     Shared results are computed once: `["ego", "obj"]` factorises once, `["seg", "seg2"]` encodes
     once. Intermediate results are dropped, except the pictures behind estimated flow, which the
-    next step needs, and the sensors' measurements: `("sensor", "flow")`, estimated flow in px/step,
+    next step needs, and measurements: `("sensor", "flow")`, estimated flow in px/step,
     `("sensor", "estimated_motion")`, `("sensor", "noisy_depth")` in metres and
     `("sensor", "noisy_motion")`.
 
     Args:
-        representations: names, or a mapping from name to options (`representation_options`); a
-            name is one of `REPRESENTATIONS`, its key in the TensorDict is the same. Under another
-            name, a transform that writes this key.
+        representations: names from `REPRESENTATIONS`, which are also the keys in the TensorDict, or
+            a mapping from name to options (see `representation_options`). The mapping may also hold
+            transforms of your own, each under the name of the key that it writes.
         intrinsics: K `[3, 3]` of the sensor maps in pixels, or its key; raw, ego and obj need it,
             except for estimated raw flow. For `prev_intrinsics` see `RawFlow`.
         num_classes: number of semantic classes; seg and seg2 need it.
         compiled: whether flow is computed through `torch.compile`, see `RawFlow`.
         flow: source of raw flow, and thus of obj: `"exact"` (`RawFlow`), `"estimated"`
             (`EstimatedFlow`, from `("sensor", "rgb")`, compensated for the camera's motion if obj
-            is chosen), or a mapping with one of them as `source` and further options of
-            `EstimatedFlow`. Ego flow, computed from depth and the camera's motion, depends on it
+            is chosen), or a mapping with one of them as `source` and options of `EstimatedFlow`.
+            Ego flow is computed from depth and the camera's motion, so it depends on this source
             only if the motion is estimated.
         motion: source of the camera's motion for ego and obj: `"exact"`, the env's
-            `("sensor", "prev_from_curr")`, or `"estimated"` (`EstimateCameraMotion`, from raw flow
-            and depth, noisy if depth is; odometry is then not read, and its drift not drawn).
+            `("sensor", "prev_from_curr")`, or `"estimated"`, by `EstimateCameraMotion` from raw
+            flow and depth, noisy if depth is. Odometry and its drift are then not used.
         noise: errors of the depth camera and of odometry: `depth_sigma_per_m`, `depth_dropout`,
             `drift_m` and `drift_rad` of `SensorNoise`, 0 by default. Depth, ego and obj are
             computed from the noisy values; raw flow and classes don't use these sensors. The noise
-            depends on the frame that `("sensor", "frame")` identifies.
+            is a function of the integers under `("sensor", "frame")`, which identify the frame.
 
     Raises:
-        ValueError: a name, an option or a source is unknown, a value can't be used, or
-            `intrinsics` or `num_classes` is missing.
+        ValueError: a name, an option or a source is unknown, a value is invalid, or `intrinsics` or
+            `num_classes` is missing.
 
     Example:
         >>> K = [[42.0, 0.0, 42.0], [0.0, 42.0, 42.0], [0.0, 0.0, 1.0]]
@@ -144,7 +144,7 @@ def representation_stack(
         else:
             sources = []
         for transform in sources:
-            if transform.out_keys[0] not in flows:  # errors name what is made of it
+            if transform.out_keys[0] not in flows:  # errors name the representations that need it
                 transform.label = " and ".join(map(repr, flows))
         is_written = any("raw" in transform.out_keys for transform in sources)
         factors = {name: flows[name] for name in flows if not (name == "raw" and is_written)}
@@ -158,7 +158,7 @@ def representation_stack(
 
 
 class DropKeys(ExcludeTransform):
-    """Drops keys that no one needs any more, at the root and under `"next"`; nested ones whole."""
+    """Drops keys, with all that is nested under them, at the root and under `"next"`."""
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns a batch without the keys."""
@@ -166,7 +166,7 @@ class DropKeys(ExcludeTransform):
         return tensordict.exclude(*keys, *(("next", key) for key in keys))
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
-        """Returns the specs without the keys; TorchRL's own looks for them among leaves alone."""
+        """Returns the specs without the keys; TorchRL's method only finds leaves."""
         for key in self.excluded_keys:
             del output_spec["full_observation_spec"][key]
         return output_spec
@@ -175,11 +175,11 @@ class DropKeys(ExcludeTransform):
 def _check_known(what: str, names: Iterable[object], known: Collection[str]) -> None:
     for name in names:
         if name not in known:
-            raise ValueError(f"unknown {what} {name!r}. There are {list(known)}")
+            raise ValueError(f"unknown {what} {name!r}; known are {list(known)}")
 
 
 def _with_options(representations: Representations) -> tuple[dict[str, Options], dict[str, Any]]:
-    """Returns all options of the representations, and the transforms under other names."""
+    """Returns the representations with all of their options, and the user's transforms, by name."""
     if isinstance(representations, str) or not representations:
         raise ValueError(
             f"representations must be a list of names, some of {list(REPRESENTATIONS)}; "
@@ -230,7 +230,7 @@ def _noise(
     given: Options = known | dict(noise or {})
     SensorNoise(**given)  # checks all values, used or not
     split = [name for name in chosen if name in ("ego", "obj")]
-    readers = {  # raw flow is not measured by a depth camera
+    readers = {  # raw flow is exact or estimated from pictures: it needs no noisy sensor
         "depth": [name for name in chosen if name in ("depth", "depth2", *split)],
         "motion": split if reads_motion else [],
     }
@@ -250,7 +250,7 @@ def _noise(
 def _maps(
     chosen: Mapping[str, Options], num_classes: int | None, depth_key: NestedKey
 ) -> list[Transform]:
-    """Returns the transforms of rgb, seg, depth and, last, of stacks of them."""
+    """Returns the transforms of rgb, seg and depth, followed by those that stack their frames."""
 
     def one(name: str, key: str, options: Options) -> Transform:
         if name == "rgb":
@@ -294,9 +294,9 @@ class _Camera:
 def _exact_flow(
     flows: Mapping[str, Options], camera: _Camera, needs_unscaled: bool, estimates_motion: bool
 ) -> list[Transform]:
-    """Returns `RawFlow` and, if it is asked for, the camera's motion made of it.
+    """Returns `RawFlow` and, with `estimates_motion`, the transform that estimates the motion.
 
-    With `needs_unscaled`, raw is made of the same flow later, by `FlowFactorize`.
+    With `needs_unscaled`, `RawFlow` writes flow in px/step, and `FlowFactorize` scales it to raw.
     """
     if not needs_unscaled:
         return [RawFlow(**camera.options, **flows["raw"])] if "raw" in flows else []
@@ -307,10 +307,10 @@ def _exact_flow(
 def _estimated_flow(
     flows: Mapping[str, Options], estimator: Options, camera: _Camera, estimates_motion: bool
 ) -> list[Transform]:
-    """Returns the pair of pictures, the flow between them and, if asked for, the camera's motion.
+    """Returns the transforms of picture pairs, flow and, with `estimates_motion`, camera motion.
 
-    obj is made of flow that is compensated for the camera's motion. Where that motion is estimated,
-    too, it is made of a first, uncompensated flow.
+    obj needs flow that is compensated for the camera's motion. If the motion is estimated, too, it
+    is estimated from a first flow without compensation.
     """
     pictures = FrameStack(k=2, in_keys=[_PICTURE_KEY], out_keys=[_PICTURES_KEY])
     has_raw = "raw" in flows
@@ -328,7 +328,7 @@ def _estimated_flow(
     compensated = EstimatedFlow(**estimator, **written, **camera.k, in_keys=inputs)
     if not estimates_motion:
         return [pictures, compensated]
-    # a coarser estimate is enough for the camera's motion
+    # A coarser estimate is enough for the camera's motion.
     coarser = {"preset": "medium"} if estimator.get("preset") == "fine" else {}
     first = EstimatedFlow(
         **estimator | coarser,
@@ -351,7 +351,7 @@ def _motion(flow: NestedKey, camera: _Camera, picture: NestedKey | None = None) 
 
 
 def _split(factors: Mapping[str, Options], unscaled: NestedKey, camera: _Camera) -> list[Transform]:
-    """Returns one `FlowFactorize` for the flows that no source writes itself."""
+    """Returns one `FlowFactorize` for the flows that no source has written."""
     if not factors:
         return []
     raw = [] if set(factors) == {"ego"} else [unscaled]

@@ -266,6 +266,7 @@ def test_a_state_written_as_json_goes_on_bit_for_bit(make_street):
         ({"frame_rate_hz": 0}, r"frame_rate_hz is 0.0"),
         ({"sensors": ("depth", "lidar")}, r"unknown sensors \['lidar'\].* depth, "),
         ({"renderer": "pybullet", "picture_scale": 2}, "picture_scale=2 needs"),
+        ({"picture_scale": 1.5}, "picture_scale.* 1.5"),
         ({"render_mode": "human"}, "render_mode is 'human'.*HumanRendering"),
     ],
 )

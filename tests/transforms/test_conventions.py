@@ -411,6 +411,7 @@ def test_keys_may_be_elsewhere():
         (lambda: sensors_from("maniskill", far_m=9.0), "far_m"),
         (lambda: sensors_from("kubric"), "intrinsics"),
         (lambda: sensors_from("carla", flow=True), "flow"),
+        (lambda: sensors_from("carla", static_ids=[7]), "body_ids"),
         (lambda: sensors_from("newton", keys={"depth": "z"}), "depth"),
     ],
 )

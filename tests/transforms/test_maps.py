@@ -62,6 +62,7 @@ def test_ids_that_uint8_can_not_hold_are_refused(ids, said):
     [
         ({"num_classes": 3, "encoding": "rgb"}, r"\['ids', 'onehot'\], got 'rgb'"),
         ({"num_classes": 257}, "1 to 256"),
+        ({"num_classes": 2.5}, "num_classes.* 2.5"),
         ({"range_m": math.inf}, "range_m must be a positive"),
         ({"missing": 1.5}, r"missing must be in \[0, 1\]"),
     ],

@@ -168,6 +168,7 @@ def test_noise_by_frame_is_in_no_state_and_the_same_at_the_root_and_under_next()
         ({"drift_m": math.inf}, "drift_m.* inf"),
         ({"depth_dropout": 1.5}, r"depth_dropout.* 1\.5"),
         ({"flow_sigma_px": 1.0}, "flow_sigma_px.*'flow'"),
+        ({"seed": 1.5}, "seed.* 1.5"),
         ({"out_keys": ["only"]}, "writes 2 keys"),
     ],
 )
