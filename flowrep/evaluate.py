@@ -19,7 +19,7 @@ require("evaluation", "train", "hydra", "pydantic", module=__name__)
 
 from flowrep.config import UsageError
 from flowrep.config.cli import EXIT_USAGE, folder_name, is_a_mistake, print_error, run_command
-from flowrep.config.schema import EvaluateConfig
+from flowrep.config.schema import EvaluateConfig, check_policy
 from flowrep.progress import StopRequest
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def run(config: EvaluateConfig) -> None:
 
 def candidates_of(config: EvaluateConfig) -> list[Candidate]:
     """Returns the agents to evaluate: of runs and sweeps, or policies from other projects."""
-    from flowrep.experiment.run import RunFolder, check_policy
+    from flowrep.experiment.run import RunFolder
 
     runs: dict[Path, RunFolder] = {}  # each run once, even if it is named in several ways
     for path in config.run or []:

@@ -1,7 +1,7 @@
-"""Options of algorithms and of what they see: each with its type, its range and its meaning.
+"""Options of algorithms, representations, flow and noise: their types, ranges and meanings.
 
-An algorithm takes the object as it is, and `flowrep.config.schema` puts it into the commands'
-configs. Nothing here imports PyTorch, so that a command can refuse a config at once.
+Each class is a section of the commands' configs in `flowrep.config.schema`; an algorithm takes its
+options as such an object. Nothing here imports PyTorch, so that commands can refuse a config fast.
 
 >>> DiscreteSACOptions(gamma=0.97).tau
 0.005
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 # Larger whole numbers are not exact as floats.
 Count = Annotated[int, Field(ge=1, le=2**53)]
@@ -33,12 +33,12 @@ CLASS = r"^\w+(\.\w+)+$"  # package.module.Class
 
 
 class Options(BaseModel):
-    """Named values: unknown names are refused, types are strict, and nothing can be set later."""
+    """Named values: unknown names are refused, types are strict, and values can't be changed."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
     def plain(self) -> dict[str, Any]:
-        """Returns names and values as they are written in a config."""
+        """Returns names and values as in a config."""
         return self.model_dump(by_alias=True)
 
 
@@ -46,7 +46,7 @@ class Options(BaseModel):
 
 
 class AlgorithmOptions(Options):
-    """What a config says about any algorithm."""
+    """Options of any algorithm."""
 
     target: str = Field("", alias="_target_", pattern=CLASS)
 
@@ -60,9 +60,9 @@ class LearnerOptions(AlgorithmOptions):
 
     precision: Literal["auto", "bf16", "fp32"] = "auto"  # of activations; weights are float32
     learning_rate: Positive = 3e-4  # Adam's, falls linearly to 0 at the end of the training
-    gamma: Share = 0.99  # discount a frame
+    gamma: Share = 0.99  # discount per frame
     hidden_size: Count = 512  # of the single hidden layer after the embeddings
-    batch_size: Count = 1024  # steps an update
+    batch_size: Count = 1024  # transitions per update
 
 
 class OffPolicyOptions(LearnerOptions):
@@ -71,13 +71,13 @@ class OffPolicyOptions(LearnerOptions):
     A transition spans `n_steps` frames: r is the discounted sum of their rewards, and γ becomes γⁿ.
     """
 
-    tau: PositiveShare = 0.005  # share of the online weights in each move of the target weights
+    tau: PositiveShare = 0.005  # share of the online weights in each update of the target weights
     replay_capacity: Count = 10_240  # frames
-    frames_per_update: Count = 10  # of all environments
+    frames_per_update: Count = 10  # of all envs together
     learning_starts: Count | None = None  # frames before the first update; None: one batch
     n_steps: Count = 1
     layer_norm: bool = False  # of each map's embedding, see `flowrep.agent.networks.Encoder`
-    mirror: bool = False  # half of each batch is replaced by its left-right images
+    mirror: bool = False  # replace half of each batch by its left-right images
 
     def first_update(self, num_envs: int) -> tuple[str, int]:
         """Returns the frames until the memory holds enough for an update."""
@@ -85,8 +85,9 @@ class OffPolicyOptions(LearnerOptions):
         starts = getattr(self, key)
         if starts < num_envs:
             raise ValueError(
-                f"algorithm.{key}={starts} is less than num_envs={num_envs}: before their second "
-                "step there is nothing to learn from; raise learning_starts, or lower num_envs"
+                f"algorithm.{key}={starts} is less than num_envs={num_envs}, but there is nothing "
+                "to learn from before the envs' second step; raise learning_starts, or lower "
+                "num_envs"
             )
         return key, starts + self.frames_per_update
 
@@ -106,9 +107,9 @@ class DiscreteSACWithValueOptions(SoftActorCriticOptions):
 class DiscreteSACOptions(SoftActorCriticOptions):
     """Options of `algorithm=dsac`.
 
-    With a shared encoder, policy and Q-functions read one set of encoders, trained by L_Q alone. In
-    y both read its target, so that each observation is encoded once. Separate encoders are one set
-    each, and π(·|s') in y reads the policy's.
+    With a shared encoder, policy and Q-functions read one set of encoders, which only L_Q trains.
+    For the target y, both read the target encoders, so that each observation is encoded once. With
+    separate encoders, policy and Q-functions have a set each, and π(·|s') in y reads the policy's.
     """
 
     encoder: Literal["shared", "separate"] = "shared"
@@ -125,18 +126,25 @@ class DoubleDQNOptions(OffPolicyOptions):
 class PPOOptions(LearnerOptions):
     """Options of `algorithm=ppo`."""
 
-    batch_size: Count = 256  # steps an update; an incomplete last batch is left out of its pass
-    rollout_length: Count = 64  # steps of each environment between two rounds of learning
-    epochs: Count = 4  # passes over them
+    batch_size: Count = 256  # steps per update; a pass leaves out an incomplete last batch
+    rollout_length: Count = 64  # steps of each env between two rounds of updates
+    epochs: Count = 4  # passes over these steps in a round
     gae_lambda: Share = 0.95  # GAE's λ, from 0 (relies on V) to 1 (relies on the rewards)
-    clip: PositiveShare = 0.2  # ρ farther than this from 1 brings no more
+    clip: PositiveShare = 0.2  # moving ρ farther than this from 1 gains nothing
     value_weight: NotNegative = 0.5  # of L_V
     entropy_weight: NotNegative = 0.01  # of L_H
     max_grad_norm: Positive = 0.5  # of all gradients together, which are scaled down to it
 
     def first_update(self, num_envs: int) -> tuple[str, int]:
         """Returns the frames of a rollout."""
-        return "rollout_length", self.rollout_length * num_envs
+        frames = self.rollout_length * num_envs
+        if self.batch_size > frames:
+            raise ValueError(
+                f"algorithm.batch_size={self.batch_size} is more than the {frames} frames of a "
+                f"rollout ({self.rollout_length} steps of {num_envs} envs): raise rollout_length "
+                "or num_envs, or lower batch_size"
+            )
+        return "rollout_length", frames
 
 
 ALGORITHMS: dict[str, type[AlgorithmOptions]] = {
@@ -146,9 +154,9 @@ ALGORITHMS: dict[str, type[AlgorithmOptions]] = {
 """The options of flowrep's algorithms, by `_target_`."""
 
 
-# What an agent sees. The transforms' constructors hold the defaults, and check ranges again: they
-# need neither pydantic nor a config, and importing them takes 3 s, where this takes 0.1 s.
-# tests/test_configs.py holds both to the same defaults and ranges.
+# Representations, flow and noise. The transforms' constructors hold the defaults and check ranges
+# again, as they work without pydantic; importing them takes 3 s, importing this module 0.1 s.
+# tests/test_configs.py checks that both have the same defaults and ranges.
 
 
 class SegmentationOptions(Options):
@@ -183,7 +191,7 @@ class StackedDepthOptions(DepthOptions):
 
 
 class ForeignTransform(Options):
-    """A transform of the user's own, with the arguments of its constructor."""
+    """A user's transform, with the arguments of its constructor."""
 
     model_config = ConfigDict(extra="allow")
     target: str = Field(alias="_target_", pattern=CLASS)
@@ -219,6 +227,14 @@ class EstimatedFlow(Options):
     preset: Literal["ultrafast", "fast", "medium", "fine"]
     min_side_px: Count
     picture_scale: Count = 1
+
+    @model_validator(mode="after")
+    def _has_the_weights_it_needs(self) -> EstimatedFlow:
+        if self.estimator != "dis" and self.weights is None:
+            raise ValueError(f"estimator={self.estimator} needs weights=, a file")
+        if self.estimator == "dis" and self.weights is not None:
+            raise ValueError("weights= is for RAFT; estimator=dis has none")
+        return self
 
 
 class Noise(Options):

@@ -22,7 +22,7 @@ from hydra.core.hydra_config import HydraConfig
 
 from flowrep.config import UsageError
 from flowrep.config.cli import folder_name, run_command
-from flowrep.config.schema import ViewConfig
+from flowrep.config.schema import ViewConfig, check_policy
 from flowrep.files import replace_files
 from flowrep.progress import progress_bar
 from flowrep.scenes.scene import CATEGORY_ID
@@ -42,8 +42,6 @@ FILES = ("sheet.png", "episode.mp4", "plan.png", "episodes.csv", "categories.csv
 
 def run(config: ViewConfig) -> None:
     """Writes pictures, a film and tables of the scene, or opens a window on it."""
-    from flowrep.experiment.run import check_policy
-
     check_policy(config.policy)
 
     from flowrep.experiment.film import Film

@@ -147,14 +147,7 @@ class PPO(Algorithm):
         device: torch.device | str = "cpu",
     ) -> None:
         self.options, self.num_envs = options, observation_spec.shape.numel()
-        steps = options.rollout_length
-        frames_per_round = steps * self.num_envs
-        if options.batch_size > frames_per_round:
-            raise ValueError(
-                f"batch_size={options.batch_size} is more than the {frames_per_round} frames of a "
-                f"rollout ({steps} steps of {self.num_envs} envs): raise rollout_length or "
-                "num_envs, or lower batch_size"
-            )
+        _, frames_per_round = options.first_update(self.num_envs)
         self.policy = self.make_policy(
             observation_spec, action_spec, keys, options, total_frames=total_frames, device=device
         )
@@ -168,7 +161,9 @@ class PPO(Algorithm):
         super().__init__(
             self.LOSS(network, actions, options),
             learning_rate=options.learning_rate,
-            total_updates=total_frames // frames_per_round * self._updates_of(steps),
+            total_updates=total_frames
+            // frames_per_round
+            * self._updates_of(options.rollout_length),
             max_grad_norm=options.max_grad_norm,
         )
 

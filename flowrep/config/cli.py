@@ -1,7 +1,7 @@
 """Runs a command from its command line; a mistake ends in `error:` lines and exit code 2.
 
-Hydra composes the config and `flowrep.config.schema` checks it. What either refuses is caught
-at the edge. `HYDRA_FULL_ERROR=1` shows the traceback as well.
+Hydra composes the config and `flowrep.config.schema` checks it. The errors of both are caught here;
+with `HYDRA_FULL_ERROR=1`, their traceback is printed.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from flowrep.config.schema import Command, validated
 
 EXIT_USAGE = 2
 FOLDERS = ("resume", "run", "input", "output", "hydra.run.dir", "hydra.sweep.dir")
-"""Keys whose values are folders, which may have any name."""
+"""Keys whose values are folders, whose names may have any characters."""
 OF_THE_MACHINE = ("device", "num_workers", "threads")
 """Keys that don't define a run and may change when it is resumed."""
 _UNKNOWN_CHOICE = re.compile(r"In '[^']*': Could not (?:find|load) '([^']+)/([^/']+)'")
@@ -47,7 +47,7 @@ def run_command(config_name: str, command: Callable[[Any], Any], schema: type[Co
     def job(config: DictConfig) -> Any:
         try:
             return command(checked(config, schema))
-        except Exception as error:  # here, since Hydra would print a line of its own
+        except Exception as error:  # caught here, since Hydra would print another line
             end_with(error, schema)
 
     run_hydra(config_name, job, schema)
@@ -69,7 +69,7 @@ def run_hydra(config_name: str, job: Callable[[DictConfig], Any], schema: type[C
         sys.exit(130)
     except Exception as error:
         if isinstance(error, OSError) and not isinstance(error, HydraException):
-            problem = f"the output folder can't be made ({error}): give another with hydra.run.dir="
+            problem = f"can't create the output folder ({error}): give another with hydra.run.dir="
             error = UsageError(problem)
         end_with(error, schema)
 
@@ -77,9 +77,9 @@ def run_hydra(config_name: str, job: Callable[[DictConfig], Any], schema: type[C
 def composed(
     config_name: str, values: Mapping[str, Any], schema: type[Command]
 ) -> tuple[Any, str, list[str]]:
-    """Returns the model of a command's config in which keys have these values, for use in Python.
+    """Returns the model of a command's config with these values, for use in Python.
 
-    With it come the folder that the command would choose, and the values as overrides.
+    Also returns the folder that the command would choose, and the values as overrides.
     """
     typed = list(_overrides(values))
     register_resolvers()
@@ -105,7 +105,7 @@ def _overrides(values: Mapping[str, Any], section: str = "") -> Iterator[str]:
 
 
 def end_with(error: Exception, schema: type[Command]) -> NoReturn:
-    """Ends the process with the line of a mistake, or the traceback of a bug."""
+    """Ends the process, with the line of a mistake or the traceback of a bug."""
     if IS_DEBUGGING or not is_a_mistake(error):
         traceback.print_exception(error)
         sys.exit(1)
@@ -121,7 +121,7 @@ def end_with(error: Exception, schema: type[Command]) -> NoReturn:
 
 def is_a_mistake(error: Exception) -> bool:
     """Returns whether an error is about something that a user can change."""
-    # BrokenExecutor: of a launcher whose worker was killed, as for want of memory
+    # A launcher raises BrokenExecutor if its worker was killed, for instance for lack of memory.
     libraries = HydraException, OmegaConfBaseException, YAMLError, BrokenExecutor
     is_plugin = str(error).startswith("Unknown plugin class")  # Hydra raises a RuntimeError
     is_ours = type(error).__module__.startswith("flowrep.") or _is_out_of_memory(error)
@@ -129,7 +129,7 @@ def is_a_mistake(error: Exception) -> bool:
 
 
 def _is_out_of_memory(error: Exception) -> bool:
-    # of torch, for a GPU and on the CPU; numpy and numba raise a MemoryError
+    # PyTorch raises one of the first two; numpy and numba raise a MemoryError.
     is_gpu = type(error).__name__ == "OutOfMemoryError"
     is_cpu = isinstance(error, RuntimeError) and "can't allocate memory" in str(error)
     return isinstance(error, MemoryError) or is_gpu or is_cpu
@@ -164,7 +164,7 @@ def plain_config(config: DictConfig) -> dict[str, Any]:
 def exit_with(problem: str | Exception, remedy: str = "") -> NoReturn:
     """Ends the process with the exit code of a usage error, printing each line of the problem."""
     print_error(problem)
-    if remedy:  # no `error:` line, as a sweep takes the last of those for a run's failure
+    if remedy:  # no `error:` line: a sweep takes the last of those for the reason of a failure
         print(remedy, file=sys.stderr)
     sys.exit(EXIT_USAGE)
 
@@ -176,13 +176,13 @@ def print_error(problem: str | Exception) -> None:
 
 
 def explained(error: Exception, schema: type[Command]) -> str:
-    """Returns an error in a line; after a typo in a key or a choice, with what there is."""
+    """Returns an error's line; for a typo in a key or a choice, it lists those that there are."""
     text = str(error)
     if _is_out_of_memory(error):
         reason = text.partition("\n")[0] or "MemoryError"
         return f"out of memory ({reason}): take fewer envs, a smaller camera, network or memory"
     if isinstance(error, FileExistsError | NotADirectoryError):
-        return f"'{error.filename}': a file is where a folder should be; give another with output="
+        return f"'{error.filename}' is a file, not a folder; give another with output="
     choice = _UNKNOWN_CHOICE.match(text)
     if isinstance(error, MissingConfigException) and choice:
         group, name = choice.groups()
@@ -202,18 +202,18 @@ def explained(error: Exception, schema: type[Command]) -> str:
 
 
 def _needed(key: str, schema: type[Command]) -> str:
-    """Returns that a key needs a value, with the first line of the command's file in conf/."""
+    """Returns the line for a key without a value, with the example at the top of conf/<command>."""
     example = (CONF_DIR / f"{_name(schema)}.yaml").read_text("utf-8").partition("\n")[0]
     return f"{key} needs a value, for example: {example.removeprefix('# ')}"
 
 
 def _name(schema: type[Command]) -> str:
-    """Returns the name of a command, which its file in conf/ has, too."""
+    """Returns the name of a command, which is also that of its file in conf/."""
     return schema.__name__.removesuffix("Config").lower()
 
 
 def _unknown_key(key: str, schema: type[Command]) -> str:
-    """Returns that there is no such key, and the sections that have one, or all keys."""
+    """Returns the line for an unknown key, with the sections that have such a key, or all keys."""
     if "." in key:
         return f"unknown key '{key}'; python -m flowrep.{_name(schema)} --cfg job shows all keys"
     groups = [group for group in config_groups() if group in schema.model_fields]
@@ -226,7 +226,7 @@ def _unknown_key(key: str, schema: type[Command]) -> str:
 
 
 def _show_if_asked(arguments: Sequence[str], config_name: str) -> None:
-    """Prints the version or the keys with the comments of conf/, and ends, if it was asked to."""
+    """Ends the process after --version or --help, which prints the keys and comments of conf/."""
     if "--version" in arguments:
         print(f"flowrep {__version__}")
         sys.exit(0)
@@ -247,26 +247,26 @@ def _show_if_asked(arguments: Sequence[str], config_name: str) -> None:
 
 
 def as_typed(arguments: Sequence[str], schema: type[Command]) -> list[str]:
-    """Returns a command line as Hydra reads it: folders quoted, those without a key named `run`."""
+    """Returns a command line for Hydra: folders are quoted; those without a key get `run`."""
     folders, others, previous = [], [], ""
     for text in arguments:
         key, _, value = text.partition("=")
         is_split = value.startswith("[") and "]" not in value  # by the shell, at a space
         if is_split and not Path(value).exists():
-            raise UsageError(f"'{text}' is no list: write {key}=[a,b], or '{key}=[a, b]' in quotes")
+            raise UsageError(f"'{text}' is not a list: write {key}=[a,b] or '{key}=[a, b]'")
         is_own = text[:1] not in "-~+" and not previous.startswith("-")
         if is_own and "run" in schema.model_fields and (text == key or Path(text).exists()):
             folders.append(text)
         else:
             others.append(override(key, value) if _is_folder(key, value) else text)
         previous = text
-    # argparse takes all keys from one stretch: `seed=0,1 -m scene=s_turn` has two
+    # argparse needs all keys side by side, which those of `seed=0,1 -m scene=s_turn` are not.
     flags = {"-m", "--multirun"} & {*others}
     others = [*flags, *(text for text in others if text not in flags)]
     if not folders:
         return others
     if any(text.startswith("run=") for text in others):
-        raise UsageError(f"'{folders[0]}' and run= name folders in two ways: write the names alone")
+        raise UsageError(f"'{folders[0]}' and run= both name folders: leave out run=")
     quoted = [override("run", text).removeprefix("run=") for text in folders]
     return [f"run=[{','.join(quoted)}]" if quoted[1:] else f"run={quoted[0]}", *others]
 
@@ -279,7 +279,7 @@ def _is_folder(key: str, value: str) -> bool:
 
 
 def value_of(text: str) -> str:
-    """Returns the value of an override of a text, without Hydra's quotes."""
+    """Returns the value of an override as text, without Hydra's quotes."""
     parsed = _parsed(text)
     return text.partition("=")[2] if parsed is None else str(parsed.value())
 
@@ -297,7 +297,7 @@ def override(key: str, text: str) -> str:
     parsed = None if "${" in text else _parsed(f"{key}={text}")
     if parsed is not None and parsed.value() == text:
         return f"{key}={text}"
-    # OmegaConf would replace an interpolation, and takes backslashes before one for escapes
+    # OmegaConf would replace an interpolation, and takes backslashes before one as escapes.
     text = re.sub(r"(\\*)\$\{", lambda match: match[1] * 2 + r"\${", text)
     return f"{key}={QuotedString(text, Quote.single).with_quotes()}"
 
@@ -313,7 +313,7 @@ def line_for(command: str, **values: str) -> str:
 
 
 def register_resolvers() -> None:
-    """Adds what conf/ calls to name folders: `${run_name:scene,...}` and the like."""
+    """Registers the functions that conf/ calls to name folders, such as `${run_name:scene,...}`."""
     for resolver in (run_name, folder_name, run_of_sweep, unless_resumed):
         OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
 
@@ -328,7 +328,7 @@ def run_name(
 
 
 def unless_resumed(resume: str | None, folder: str) -> str:
-    """Returns the folder of a new run; Hydra makes none for the current one, a resumed run's."""
+    """Returns a new run's folder; for a resumed run the current one, so that Hydra creates none."""
     return folder if resume is None else "."
 
 
@@ -343,7 +343,7 @@ def folder_name(text: str) -> str:
 
 
 def run_of_sweep(overrides: Iterable[str]) -> str:
-    """Returns the folder name of a sweep's run, which needs no quotes in a shell or in Hydra.
+    """Returns the name of a sweep's run's folder, which needs no quotes in a shell or in Hydra.
 
     Settings of the machine are left out.
 

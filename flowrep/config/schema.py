@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Collection, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, Union, get_args, get_type_hints
 
 from pydantic import (
@@ -54,7 +55,7 @@ Workers = CountOrZero | Literal["auto"]
 
 def _distinct(values: Any) -> Any:
     if isinstance(values, list) and any(value in values[:i] for i, value in enumerate(values)):
-        raise ValueError("one value is there twice")
+        raise ValueError("a value is repeated")
     return values
 
 
@@ -83,7 +84,7 @@ class Command(Options):
 def _in_their_order(value: Any, check: Any) -> dict[str, Any]:
     """Checks options and returns them as they are: a model would forget the order of its keys."""
     if isinstance(value, Mapping) and not all(str(name).isidentifier() for name in value):
-        raise ValueError("a name is of letters, digits and _")
+        raise ValueError("a name consists of letters, digits and _")
     check(value)
     if not value:
         raise ValueError("is empty; choose at least one: representations=[ego,obj]")
@@ -96,7 +97,7 @@ Flow = Annotated[ExactFlow | EstimatedFlow, Field(discriminator="source")]
 
 
 class ForeignAlgorithm(AlgorithmOptions):
-    """Options of an algorithm of the user's own, which `experiment.build` checks."""
+    """Options of a user's algorithm, which `experiment.build` checks."""
 
     model_config = ConfigDict(extra="allow")
     target: str = Field(alias="_target_", pattern=CLASS)
@@ -118,10 +119,10 @@ def _scene_data(scene: Any) -> Any:
 
 
 def _kind(section: Any) -> str:
-    """Returns which options an algorithm's section holds."""
+    """Returns the tag of an algorithm's section in the union `Algorithm`."""
     if isinstance(section, Mapping):
         target = section.get("_target_")
-    else:  # a model, or what is none
+    else:  # a model, or an invalid value
         target = getattr(section, "target", None)
     return target if isinstance(target, str) and target in ALGORITHMS else "foreign"
 
@@ -143,12 +144,12 @@ else:
         ],
         Discriminator(_kind),
     ]
-# pydantic puts the member of a union between the keys in an error's place
+# pydantic puts a union's tag between the keys of an error's location.
 _MEMBERS = {"exact", "estimated", "foreign", *ALGORITHMS}
 
 
 class Trusted(Options):
-    """The class that a run's config may name, if it is not one of flowrep's own."""
+    """A class outside of flowrep that a run's config may name."""
 
     target: Text | None = Field(alias="_target_")
 
@@ -157,7 +158,7 @@ class Trusted(Options):
 
 
 class EnvConfig(Command):
-    """What an environment is made of, on this machine."""
+    """The keys from which an env is built."""
 
     seed: Seed
     device: Device
@@ -271,7 +272,7 @@ class EvaluateConfig(Command):
                     "package.module:make, path.pt2 or path.safetensors"
                 )
         if own and len(own) < len(self.policy):
-            raise ValueError("policy: greedy and sampled are a run's; evaluate your own apart")
+            raise ValueError("policy: greedy and sampled are of runs; evaluate others separately")
         if own and self.run is not None:
             raise ValueError(f"run= and policy={own[0]} can't be combined: give one of them")
         if not own and self.run is None:
@@ -286,7 +287,7 @@ class EvaluateConfig(Command):
             if key == "representations" and all(options.keys() == {"_target_"} for options in maps):
                 continue
             if not own and getattr(self, key) is not None:
-                raise ValueError(f"{key}= is for a policy of your own; a run's is in its config")
+                raise ValueError(f"{key}= is for a policy of your own; a run has its own {key}")
         return self
 
 
@@ -328,7 +329,7 @@ class ReportConfig(Command):
 
 
 class Reader(Options):
-    """A reader of recordings, whose options its signature checks."""
+    """A reader of recordings, whose options are checked against its signature."""
 
     model_config = ConfigDict(extra="allow")
     target: str = Field(alias="_target_", pattern=r"^flowrep\.sequences\.\w+$")
@@ -339,7 +340,7 @@ class Reader(Options):
 
     @model_validator(mode="after")
     def _has_what_it_needs(self) -> Reader:
-        # Not ???, which does not replace the value of the format that this one begins with.
+        # Not ???, which would not replace the value of the format that this one extends.
         for key in [key for key, value in self.options().items() if value == "needed"]:
             raise ValueError(f"{key} needs a value: format.{key}=...")
         return self
@@ -380,7 +381,7 @@ class FactorizeConfig(Command):
     def _has_a_pair(self) -> FactorizeConfig:
         if self.stop is not None and self.stop < self.start + self.stride + 1:
             least = self.start + self.stride + 1
-            raise ValueError(f"stop={self.stop} leaves no pair of frames: at least {least}")
+            raise ValueError(f"stop={self.stop} leaves no pair of frames; give {least} or more")
         return self
 
 
@@ -399,11 +400,11 @@ def validated(schema: type[Model], plain: Mapping[str, Any], source: str = "") -
 def validated_run(plain: Any, source: str, trusted: Collection[str] = ()) -> TrainConfig:
     """Returns the config that a run stored.
 
-    Its classes are flowrep's own, or `trusted`, which the user typed: a file that may come from
-    somebody else must not name what is imported.
+    It may only name classes of flowrep, or `trusted` ones, which the user typed: a file that may
+    come from somebody else must not decide what is imported.
     """
     if not isinstance(plain, Mapping):
-        raise UsageError(f"{source} holds no run's config: restore the file")
+        raise UsageError(f"{source} does not hold a run's config: restore the file")
     config = validated(TrainConfig, plain, source)
     named = {"algorithm": config.algorithm.target}
     named |= {
@@ -414,14 +415,30 @@ def validated_run(plain: Any, source: str, trusted: Collection[str] = ()) -> Tra
     for key, target in named.items():
         if target not in (*ALGORITHMS, *trusted):
             raise UsageError(
-                f"{source} names code that isn't flowrep's own, {target}: if you trust it, add "
+                f"{source} names code outside of flowrep, {target}: if you trust it, add "
                 f"{key}._target_={target}"
             )
     return config
 
 
+def check_policy(name: str) -> None:
+    """Raises UsageError if `policy=` names no policy, as far as can be told without PyTorch."""
+    if Path(name).is_dir() or name in (*get_args(BaselineName), "pretrained"):
+        return
+    script, is_reference, _ = name.rpartition(":")
+    file, ends = (script, (".py",)) if is_reference else (name, (".pt2", ".safetensors"))
+    if file.endswith(ends):
+        if not Path(file).is_file():
+            raise UsageError(f"policy={name}: there is no file '{file}'")
+    elif not is_reference:
+        raise UsageError(
+            f"policy={name}: give {', '.join(get_args(BaselineName))}, pretrained, a run's folder, "
+            "path.safetensors, path.py:make, package.module:make or path.pt2"
+        )
+
+
 def check_options(maker: type, options: Mapping[str, Any], section: str) -> None:
-    """Checks a section's options against the signature of a class, beyond its first argument."""
+    """Checks a section's options against a constructor's parameters, except for the first one."""
     hints = get_type_hints(maker.__init__)  # type: ignore[misc]
     _, *parameters = inspect.signature(maker).parameters.values()
     fields: dict[str, Any] = {
@@ -437,7 +454,7 @@ def _key(details: Any) -> str:
 
 
 def _line(details: Any) -> str:
-    """Returns pydantic's error in a line that begins with the key."""
+    """Returns one of pydantic's errors as a line that begins with the key."""
     key = _key(details)
     kind, value = details["type"], details["input"]
     message = details["msg"].removeprefix("Value error, ")

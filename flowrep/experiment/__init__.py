@@ -1,1 +1,1 @@
-"""The parts of a run: folder, training loop, cadences, evaluation and interruption."""
+"""Runs: folder and lock, training loop, evaluation, films and sweeps; and the agents they give."""

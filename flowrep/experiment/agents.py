@@ -1,4 +1,4 @@
-"""Agents: trained, loaded, evaluated and saved from Python, and what `policy=` names."""
+"""Trains, loads, evaluates and saves agents from Python, and loads what `policy=` names."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from flowrep.config.schema import (
     ExactFlow,
     Noise,
     TrainConfig,
+    check_policy,
     validated,
     validated_run,
 )
@@ -30,7 +31,7 @@ from flowrep.experiment import build
 from flowrep.experiment.evaluation import Driver, PairedEvaluation
 from flowrep.experiment.external import Task, check_card, load_policy
 from flowrep.experiment.outcomes import EpisodeRecord
-from flowrep.experiment.run import RunFolder, check_policy, origin_of
+from flowrep.experiment.run import RunFolder, origin_of
 from flowrep.experiment.runner import EVALUATION_ENVS, Runner
 from flowrep.progress import StopRequest
 from flowrep.scenes import Scene, load_scene
@@ -42,7 +43,7 @@ _SCALE = ".scale"
 
 
 class Agent(Driver):
-    """A policy and the env in which it acts, usually one that was trained.
+    """A policy, usually a trained one, and the config of the env in which it acts.
 
     >>> agent = Agent.load("pretrained", scene="straight_road")
     >>> [episode] = agent.evaluate(episodes=1)
@@ -60,16 +61,17 @@ class Agent(Driver):
     ) -> Agent:
         """Trains an agent as `python -m flowrep.train` does, and returns it.
 
-        The run is saved in its folder, where `resume=` of the command continues it, with the final
-        evaluation that the command adds. Ctrl-C saves it too, and raises KeyboardInterrupt.
+        The run is saved in its folder, without a final evaluation, which
+        `python -m flowrep.train resume=<folder>` adds. Ctrl-C saves the run, too, and raises
+        KeyboardInterrupt.
 
         Args:
             folder: the run's folder; by default outputs/<day>/<time>_<name>.
-            callback: is called with each row of metrics.csv, `frames` included.
+            callback: called with each row of metrics.csv, `frames` included.
             overrides: keys of conf/train.yaml and their values, such as `scene="s_turn"`,
                 `representations=["ego", "obj"]`, `preset="laptop"`, `total_frames=50_000` or
-                `evaluation={"every_frames": 0}`; beside the choice of a whole section, a key in it
-                is `**{"scene.time_limit_steps": 100}`.
+                `evaluation={"every_frames": 0}`. To choose a section and also set a key in it, add
+                `**{"scene.time_limit_steps": 100}`.
 
         Raises:
             UsageError: a key or a value is wrong; the message names it.
@@ -102,21 +104,22 @@ class Agent(Driver):
         num_envs: int | None = None,
         num_workers: int | str = 0,
     ) -> Agent:
-        """Returns an agent, to act in a scene, or in the one of its training if None.
+        """Returns an agent that acts in `scene`, by default in the scene of its training.
 
         Args:
             name: the folder of a run, a .safetensors file that `save` wrote, "pretrained" (the
                 agent of the scene that comes with flowrep), a baseline, or a policy from another
                 project: path.py:make, package.module:make or path.pt2.
-            scene: its name, or its definition; the camera remains that of the training.
-            representations: the maps of a policy from another project, names or options by name.
-            flow: where they come from, as in conf/flow; exact flow if None.
-            motion: of the camera, "exact" or "estimated".
-            noise: of its sensors; none if None.
+            scene: a scene's name or definition; the camera remains that of the training.
+            representations: the maps that a policy from another project reads: names, or a mapping
+                from name to options. The next three are for such a policy, too.
+            flow: the source of raw and obj, as in conf/flow; exact if None.
+            motion: the source of the camera's motion, "exact" or "estimated"; exact if None.
+            noise: errors of depth and of the camera's motion; none if None.
             trusted: classes outside of flowrep that a run may name; their code then runs.
             precision: the number format of its networks, instead of the run's.
             device: of its networks and envs.
-            num_envs: side by side; by default those of its training.
+            num_envs: envs side by side; by default as many as in its training.
             num_workers: processes that step them, or "auto".
 
         Raises:
@@ -136,9 +139,9 @@ class Agent(Driver):
             names = {"representations": [*representations]}
             maps = composed("train", names, TrainConfig)[0].representations
         if not is_external:
-            # of a run's own transform, `trusted` has the class
-            own = [each for each in maps.values() if {*(each or {})} != {"_target_"}] or None
-            given = {"representations": own, "flow": flow, "motion": motion, "noise": noise}
+            # A `_target_` alone only trusts a class that a run names; `trusted` has it.
+            chosen = [each for each in maps.values() if {*(each or {})} != {"_target_"}] or None
+            given = {"representations": chosen, "flow": flow, "motion": motion, "noise": noise}
             for key, value in given.items():
                 if value is not None:
                     raise UsageError(f"{key}= is for a policy of your own, not for policy={name}")
@@ -147,7 +150,8 @@ class Agent(Driver):
                 raise UsageError(f"representations needs a value for policy={name}")
             asked: dict[str, Any] = {
                 "scene": given_scene or load_scene("straight_road"),
-                "representations": {"rgb": {}},  # replaced: options that are left out have defaults
+                # Replaced below: the schema would refuse maps whose options have defaults.
+                "representations": {"rgb": {}},
                 "flow": flow or ExactFlow(),
                 "motion": motion or "exact",
                 "noise": noise or Noise(),
@@ -188,13 +192,13 @@ class Agent(Driver):
         policies: Sequence[str] = ("greedy",),
         baselines: Sequence[str] = (),
     ) -> list[EpisodeRecord]:
-        """Returns the records of episodes, those that `flowrep.evaluate` runs for the same seed.
+        """Returns the records of the episodes that `flowrep.evaluate` runs for the same seed.
 
         Args:
-            episodes: for each policy, speed and frame rate.
+            episodes: the number of episodes for each policy, speed and frame rate.
             speeds: the pedestrians' speed modes; by default that of the training.
-            fps: frame rates; by default the scene's.
-            seed: of the first episode.
+            fps: frame rates, 1/s; by default the scene's.
+            seed: of the first episode; the others follow.
             policies: "greedy" takes the likeliest action, "sampled" draws one.
             baselines: such as "planner", "never_turn" and "random", on the same episodes.
         """
@@ -216,10 +220,10 @@ class Agent(Driver):
     def save(self, path: str | Path, *, small: bool = False) -> None:
         """Writes the policy and its config into one file, which `load` reads.
 
-        `small` rounds to a byte a weight, 1/127 of the largest of its row.
+        With `small`, each weight takes one byte, see `packed`.
         """
         if not isinstance(self.config, TrainConfig) or isinstance(self.policy, str):
-            raise UsageError("only an agent that flowrep trained has weights to save")
+            raise UsageError("only an agent that flowrep trained can be saved")
         if Path(path).suffix != ".safetensors":
             raise UsageError(f"save to a file whose name ends in .safetensors, not to '{path}'")
         weights = dict(self.policy.state_dict())  # type: ignore[attr-defined]
@@ -265,7 +269,7 @@ def _pretrained(scene: Scene | None) -> Path:
 
 
 def _external(reference: str, config: EnvConfig) -> Any:
-    """Returns a policy from another project, which is given the task in the env of the config."""
+    """Returns a policy from another project, built for the task in the config's env."""
     with closing(build.env(config, num_envs=1, num_workers=0)) as env:
         maps = {name: env.observation_spec[name][0] for name in config.representations}
         task = Task(
@@ -281,10 +285,10 @@ def _external(reference: str, config: EnvConfig) -> Any:
 
 
 def packed(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Returns matrices and filters as int8, with a scale for each output; the rest as it is.
+    """Returns matrices and filters as int8 with a scale for each row, other weights unchanged.
 
-    A weight is rounded to 1/127 of the largest of its row, coarser than bfloat16, in which agents
-    compute; the pretrained agents' README.md has the success with and without.
+    A weight is rounded to 1/127 of the largest in its row. That is coarser than bfloat16, in which
+    agents compute; README.md of the pretrained agents gives their success with and without it.
     """
     stored = {}
     for name, weight in weights.items():
@@ -298,7 +302,7 @@ def packed(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def unpacked(stored: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Returns the weights that `packed` stored; others pass as they are.
+    """Returns the weights that `packed` stored; others are unchanged.
 
     >>> weights = {"weight": torch.tensor([[1.0, -0.5], [0.0, 0.0]])}
     >>> unpacked(packed(weights))["weight"]

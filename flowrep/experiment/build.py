@@ -1,4 +1,4 @@
-"""Builds what a config describes: env, agent, policy, device. Below it nobody sees a config."""
+"""Builds what a config describes: env, agent, policy, device. Modules below see no config."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from flowrep.envs.torchrl_env import usable_device
 from flowrep.envs.workers import available_cores
 from flowrep.options import ALGORITHMS, AlgorithmOptions
 
-ENVS_PER_WORKER = 24  # of an evaluation: fewer aren't worth the start of a process
+ENVS_PER_WORKER = 24  # in an evaluation: fewer aren't worth starting a process
 
 
 def device(name: str) -> torch.device:
@@ -31,9 +31,9 @@ def device(name: str) -> torch.device:
 
 
 def env(config: EnvConfig, **changes: Any) -> EnvBase:
-    """Returns the env that the config describes, with changes of `make_env`'s arguments.
+    """Returns the env that the config describes; `changes` replace arguments of `make_env`.
 
-    Observations include `is_init`, which marks the beginning of an episode for the replay memory.
+    Observations include `is_init`, by which the replay memory sees that an episode begins.
     """
     num_envs = changes.get("num_envs", config.num_envs)
     num_workers = changes.get("num_workers", config.num_workers)
@@ -66,7 +66,7 @@ def agent(config: TrainConfig, env: EnvBase) -> Algorithm:
 
 
 def policy(config: TrainConfig, env: EnvBase) -> Any:
-    """Returns the untrained policy of the config's algorithm alone."""
+    """Returns the config's policy, untrained, without the rest of the agent."""
     maker, options = algorithm(config.algorithm)
     return maker.make_policy(*_specs(config, env), options, **_run(config))
 
@@ -80,7 +80,7 @@ def _run(config: TrainConfig) -> dict[str, Any]:
 
 
 def algorithm(section: AlgorithmOptions) -> tuple[Any, Any]:
-    """Returns the class that a section names, and its options, checked if it isn't flowrep's."""
+    """Returns the class that a section names, and its options; checks those of a user's class."""
     maker = _class("algorithm", section.target, Algorithm)
     if section.target in ALGORITHMS:
         return maker, section
@@ -89,26 +89,26 @@ def algorithm(section: AlgorithmOptions) -> tuple[Any, Any]:
 
 
 def check_classes(config: TrainConfig) -> None:
-    """Checks that the classes which a config names exist and take their options."""
+    """Checks that the classes that a config names exist and accept their options."""
     algorithm(config.algorithm)
     for name, options in config.representations.items():
         _options(name, options)
 
 
 def _options(name: str, options: Mapping[str, Any] | None) -> Mapping[str, Any] | Transform | None:
-    """Returns a representation's options, or the transform if it is one of the user's own."""
+    """Returns a representation's options, or the user's transform that they describe."""
     if not options or "_target_" not in options:
         return options
-    own = dict(options)
-    maker = _class(f"representations.{name}", own.pop("_target_"), Transform)
+    arguments = dict(options)
+    maker = _class(f"representations.{name}", arguments.pop("_target_"), Transform)
     try:
-        return maker(**own, out_keys=name)
+        return maker(**arguments, out_keys=name)
     except (TypeError, ValueError) as error:
         raise UsageError(f"representations.{name}: {error}") from error
 
 
 def _class(key: str, target: str, base: type) -> Any:
-    """Returns the class that a config names, after checking what it is one of."""
+    """Returns the class that a config names; raises UsageError unless it is a `base`."""
     try:
         named = resolve_name(target)
     except (ImportError, AttributeError, ValueError) as error:
@@ -123,19 +123,19 @@ def _class(key: str, target: str, base: type) -> Any:
 
 
 def with_precision(config: TrainConfig) -> TrainConfig:
-    """Returns a new run's config with the number format that `precision=auto` is here."""
+    """Returns a new run's config with `precision=auto` replaced by this machine's choice."""
     section = config.algorithm
     _, options = algorithm(section)
-    if not hasattr(options, "precision"):  # an algorithm of the user's own
+    if not hasattr(options, "precision"):  # of a user's algorithm
         return config
     chosen = {"precision": resolved_precision(options.precision, device(config.device))}
     return config.model_copy(update={"algorithm": section.model_copy(update=chosen)})
 
 
 def share_cores(config: EnvConfig) -> None:
-    """Has this process use one thread on a CPU, except for updates and estimated flow.
+    """Limits this process to one thread on a CPU, except for updates and estimated flow.
 
-    Nothing else is large enough to gain by a second one, and beside another program's work, threads
+    Nothing else is large enough to gain from a second thread. If another program is busy, threads
     that wait for each other make a step take up to a hundred times as long.
     """
     if device(config.device).type == "cpu" and config.flow.source == "exact":
@@ -144,14 +144,14 @@ def share_cores(config: EnvConfig) -> None:
 
 def worker_count(num_envs: int, busy_cores: int = 0) -> int:
     """Returns the number of worker processes: one for each core that isn't busy."""
-    # in a process of a pool, such as that of hydra/launcher=joblib, others use the other cores
+    # In a pool of processes, as with hydra/launcher=joblib, the others use the other cores.
     is_in_pool = multiprocessing.current_process().name != "MainProcess"
     cores = available_cores()
     return 0 if is_in_pool or min(cores, num_envs) < 2 else min(cores - busy_cores, num_envs)
 
 
 def _threads(config: EnvConfig) -> int:
-    """Returns the number of cores that the updates of a training need."""
+    """Returns the number of cores that a training's updates use."""
     if not isinstance(config, TrainConfig) or device(config.device).type != "cpu":
         return 0
     return min(config.threads, available_cores())

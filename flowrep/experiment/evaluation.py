@@ -31,27 +31,27 @@ from flowrep.scenes import Scene
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
 _BLIND: dict[str, Any] = {"representations": {}, "noise": None, "num_workers": 0, "device": "cpu"}
-"""The env of baselines, which read the simulator and need no observation."""
-_DRAWS = 1  # separates a policy's draws from other draws of an episode's seed
+"""Changes to the env for baselines, which read the simulator's state instead of observations."""
+_DRAWS = 1  # separates a policy's draws from other draws that use the episode's seed
 
 
 @dataclass(frozen=True)
 class Driver:
-    """A policy and the env in which it acts."""
+    """A policy and the config of the env in which it acts."""
 
     policy: Policy | str  # writes `action`; or a baseline's name
     config: EnvConfig
-    frames: int = 0  # that it was trained for; 0 if unknown
+    frames: int = 0  # frames of its training; 0 if unknown
     trained_in: str | None = None  # the name of a scene, None if unknown
 
     def make_env(self, **changes: Any) -> EnvBase:
-        """Returns an env of its config, with changes of `make_env`'s arguments."""
+        """Returns the config's env; `changes` replace arguments of `flowrep.envs.make_env`."""
         num_envs = changes.get("num_envs", self.config.num_envs)
         workers = {"num_workers": build.evaluation_workers(self.config, num_envs)}
         return build.env(self.config, **workers | changes)
 
     def origin(self, evaluation: str) -> dict[str, Any]:
-        """Returns the fields of an `EpisodeRecord` that say which agent drove where."""
+        """Returns the fields of an `EpisodeRecord` that describe the agent and the scene."""
         scene = self.config.scene
         return {
             "scene": scene.name,
@@ -86,8 +86,8 @@ def evaluate(
 ) -> Iterator[EpisodeRecord]:
     """Yields the records of episodes, in the order in which they end.
 
-    Each env of the batch runs episodes back to back and idles when none remain. The policy sees
-    the busy envs alone, with two more keys for policies that remember: `env_id` int64 `[N]`, the
+    Each env of the batch runs episodes back to back and idles when none remain. The policy gets
+    only the busy envs, with two more keys for policies with a memory: `env_id` int64 `[N]`, the
     env's index, and `is_init` bool `[N, 1]`, whether its episode just began.
 
     Args:
@@ -180,10 +180,11 @@ def _act(
             actions[busy] = policy(seen)["action"].to(device)
     else:
         shares = policy.get_dist(seen).probs.double().cumsum(-1).cpu().numpy()
-        # from the episode's own generator, so that it repeats whatever else is in the batch
+        # Drawn by the episode's generator, so that an episode doesn't depend on the rest of the
+        # batch.
         drawn = np.array([running[i].rng.random() for i in busy])[:, None]
-        # the least action whose cumulated share exceeds the draw; the last share is 1 but for
-        # rounding
+        # The first action whose cumulative share exceeds the draw, which is scaled by the last
+        # share: that is 1 only up to rounding.
         chosen = (drawn * shares[:, -1:] >= shares[:, :-1]).sum(axis=-1)
         actions[busy] = torch.as_tensor(chosen, device=device)
     return actions
@@ -202,7 +203,7 @@ class PairedEvaluation:
     fps: Sequence[float]
     episodes: int  # of each group
     seed: int
-    # "greedy", "sampled" or both; or the name of a policy with only one way to act
+    # "greedy", "sampled" or both; or the name of a policy that can't do both
     policies: Sequence[str] = ("greedy",)
     baselines: Sequence[str] = ()
 
@@ -243,7 +244,7 @@ class PairedEvaluation:
             what="evaluating", desc="evaluating", total=self.total, initial=self.done,
             unit="episode", leave=False, miniters=0, mininterval=0.5,
         ) as bar:  # fmt: skip
-            # the bar's clock goes on: the first episodes take seconds
+            # Each frame redraws the bar's clock, since the first episodes take seconds.
             for episode in self._episodes(
                 make_env, policy, num_envs, stop, on_frame=lambda _: bar.update(0)
             ):
@@ -288,7 +289,7 @@ class PairedEvaluation:
     def records(self, **origin: Any) -> list[EpisodeRecord]:
         """Returns the episodes of whole groups, by speed, frame rate, policy and seed.
 
-        `origin` are the fields that say which agent drove, see `Driver.origin`.
+        `origin` are the fields that describe the agent, see `Driver.origin`.
         """
         whole = [group for group in self._groups.values() if len(group) == len(self._seeds)]
         return [replace(group[seed], **origin) for group in whole for seed in self._seeds]

@@ -24,7 +24,7 @@ from flowrep.experiment.evaluation import Driver
 from flowrep.experiment.external import CARD, LOADER, PROGRAM
 from flowrep.files import replace_files
 
-ACTIONS = ("no_op", "turn_left", "turn_right")  # by their indices in flowrep.scenes.scene
+ACTIONS = ("no_op", "turn_left", "turn_right")  # in the order of flowrep.scenes.vehicle
 
 
 class ExportError(ValueError):
@@ -32,7 +32,7 @@ class ExportError(ValueError):
 
 
 def export(agent: Driver, folder: Path) -> None:
-    """Writes a trained agent; load it with `precision="fp32"`, in which any machine computes."""
+    """Writes a trained agent; load it with `precision="fp32"`, which runs fast on any machine."""
     config: Any = agent.config
     with closing(agent.make_env(num_envs=1, num_workers=0)) as env:
         spec, (street,) = env.observation_spec, street_envs(env)
@@ -71,8 +71,8 @@ def acting_program(policy: Any, observation_spec: Composite) -> ExportedProgram:
     networks = [module for module in policy.modules() if isinstance(module, PolicyNetwork)]
     if len(networks) != 1:
         raise ExportError(
-            f"a policy is exported through its one flowrep.agent.networks.PolicyNetwork, of which "
-            f"{type(policy).__name__} has {len(networks)}; build it with acting_network()"
+            "only a policy with exactly one flowrep.agent.networks.PolicyNetwork can be exported; "
+            f"{type(policy).__name__} has {len(networks)}: build it with acting_network()"
         )
     (network,) = networks
     specs = [observation_spec[codec.key] for codec in network.codecs]
@@ -84,15 +84,15 @@ def acting_program(policy: Any, observation_spec: Composite) -> ExportedProgram:
 
 
 def write_agent(folder: Path, program: ExportedProgram, card: Mapping[str, Any]) -> None:
-    """Writes the program, its weights, the loader that needs only torch, and last the card."""
+    """Writes the program, its weights, a loader that needs only torch, and, last, the card."""
     traced = io.BytesIO()
     torch.export.save(program, traced)
     weights = {name: weight.detach().contiguous() for name, weight in program.state_dict.items()}
     files = {PROGRAM: traced.getvalue(), "agent.safetensors": save(weights)}
-    # they reveal damage, which torch.export.load does not look for
+    # Checksums reveal damage, which torch.export.load doesn't check for.
     digests = {name: zlib.crc32(data) for name, data in files.items()}
     digests[CARD] = zlib.crc32(json.dumps(dict(card)).encode())
-    files[LOADER] = Path(exported_loader.__file__).read_bytes()  # no digest, as it may be edited
+    files[LOADER] = Path(exported_loader.__file__).read_bytes()  # no checksum: it may be edited
     files[CARD] = (json.dumps({**card, "crc32": digests}, indent=2) + "\n").encode()
     folder.mkdir(parents=True, exist_ok=True)
     replace_files(folder, files, as_one=True)

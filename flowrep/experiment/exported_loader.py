@@ -1,4 +1,4 @@
-"""Loads an agent that flowrep trained, from agent.pt2 and agent.json here; needs torch alone."""
+"""Loads an agent that flowrep trained from agent.pt2 and agent.json beside it; needs only torch."""
 
 import io
 import json
@@ -14,7 +14,7 @@ HERE = Path(__file__).parent
 def make(task=None, device="cpu"):
     """Returns a function from maps by name, tensors [N, C, H, W], to actions [N].
 
-    The maps are on `device`, or on that of flowrep's task.
+    The maps are on `device`; flowrep passes a task, whose device replaces it.
     """
     card = json.loads((HERE / "agent.json").read_text())
     saved = (HERE / "agent.pt2").read_bytes()

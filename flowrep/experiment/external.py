@@ -30,7 +30,7 @@ _LIBRARIES = (
     sysconfig.get_path("stdlib"), sysconfig.get_path("purelib"), str(Path(__file__).parents[1]),
     "<frozen ",
 )  # fmt: skip
-"""How the names of files begin that the author of a policy didn't write."""
+"""Prefixes of the names of files that the author of a policy didn't write."""
 
 
 class PolicyError(Exception):
@@ -39,7 +39,7 @@ class PolicyError(Exception):
 
 @dataclass(frozen=True)
 class Task:
-    """The task, as a policy from another project is told about it."""
+    """What a policy from another project gets to know about its task."""
 
     scene: str
     representations: Mapping[str, Any]  # options by name, in the requested order
@@ -53,7 +53,7 @@ class ExternalPolicy:
     """Writes `action` `[N]`, computed by a function from another project.
 
     The function takes a TensorDict of batch `[N]` with the task's maps `[N, C, H, W]` and, for
-    policies that remember, `env_id` int64 `[N]`, the env of each row, and `is_init` bool `[N, 1]`,
+    policies with a memory, `env_id` int64 `[N]`, the env of each row, and `is_init` bool `[N, 1]`,
     whether its episode just began. It returns N integers (a tensor, an array or a list), or the
     TensorDict with `action`.
     """
@@ -89,10 +89,10 @@ class ExternalPolicy:
 def load_policy(reference: str, task: Task) -> ExternalPolicy:
     """Returns the policy that a reference names.
 
-    It is `path.py:make` or `package.module:make`, a function that is called with the task and
+    The reference is `path.py:make` or `package.module:make`, a function that takes the task and
     returns the policy's function; or `path.pt2`, a program saved by `torch.export.save` that takes
-    the maps as arguments, in the task's order (that of flowrep's export in the order of its
-    agent.json), and returns a score per action.
+    the maps as arguments and returns a score per action. The arguments have the task's order or,
+    for an agent that flowrep exported, the order in its agent.json.
     """
     with _named(reference):
         if reference.endswith(".pt2"):
@@ -133,7 +133,7 @@ def _program(path: str, task: Task) -> Callable[[TensorDictBase], Tensor]:
         ) from error
     finally:
         logger.disabled = was_disabled
-    # moving the module alone would leave the devices that are written in its graph
+    # Moving only the module would not change the devices that are written in its graph.
     program = move_to_device_pass(loaded, task.device).module()
     card = _card(path)
     names = task.representations if card is None else [each["name"] for each in card["maps"]]
@@ -149,7 +149,7 @@ def _named(name: str) -> Iterator[None]:
         raise PolicyError(f"policy '{name}': {error}") from error.__cause__
     except Exception as error:
         text = str(error).strip().splitlines()
-        # the last line that the author wrote, rather than one deep in a library
+        # The last line that the author wrote, rather than one deep in a library.
         frames = traceback.extract_tb(error.__traceback__)
         theirs = [frame for frame in frames if not frame.filename.startswith(_LIBRARIES)]
         where = f" ({theirs[-1].filename}, line {theirs[-1].lineno})" if theirs else ""
@@ -161,8 +161,8 @@ def _named(name: str) -> Iterator[None]:
 def check_card(reference: str, task: Task) -> None:
     """Checks that an exported agent gets maps like those of its training.
 
-    A policy without an agent.json beside it passes. The error has the overrides that give the right
-    maps.
+    A policy without an agent.json beside it passes. The error lists the overrides that give the
+    right maps.
     """
     with _named(reference):
         card = _card(reference)
@@ -171,8 +171,8 @@ def check_card(reference: str, task: Task) -> None:
         trained, here = _settings(card, task)
     if wrong := [key for key in trained if trained[key] != here[key]]:
         raise PolicyError(
-            f"policy '{reference}' was trained on other maps than those of "
-            f"{_overrides(here, wrong)}; give {_overrides(trained, wrong)}"
+            f"policy '{reference}' was not trained on the maps of {_overrides(here, wrong)}; give "
+            f"{_overrides(trained, wrong)}"
         )
 
 
@@ -190,12 +190,15 @@ def _card(reference: str) -> Any:
     for name in digests.keys() & {CARD, PROGRAM}:
         data = json.dumps(card).encode() if name == CARD else path.with_name(name).read_bytes()
         if zlib.crc32(data) != digests[name]:
-            raise PolicyError(f"{path.with_name(name)} is not as exported; export the agent again")
+            raise PolicyError(
+                f"{path.with_name(name)} was damaged or changed after its export; export the agent "
+                "again"
+            )
     return card
 
 
 def _settings(card: Mapping[str, Any], task: Task) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Returns what the maps depend on, by its key on the command line: in training, and here."""
+    """Returns the settings that the maps depend on, by override key: in training, and here."""
     maps = {each["name"]: each for each in card["maps"]}
     shape = task.observation_spec[next(iter(task.representations))].shape
     trained = _camera(card["maps"][0]["shape"], card["intrinsics"])
@@ -220,8 +223,8 @@ def _camera(shape: Sequence[int], K: Sequence[Sequence[float]]) -> dict[str, Any
 
 
 def _overrides(settings: Mapping[str, Any], keys: Sequence[str]) -> str:
-    """Returns settings as on the command line, `representations=[ego,obj] scene=s_turn`."""
+    """Returns settings as overrides, `representations=[ego,obj] scene=s_turn`."""
     texts = [f"{key}={json.dumps(settings[key], separators=(',', ':'))}" for key in keys]
     plain = [text.replace('"', "") for text in texts]
-    # quoted, as the card may be a stranger's, and the line may be pasted into a shell
+    # Quoted, since the card may be a stranger's and the line may be pasted into a shell.
     return " ".join(x if re.fullmatch(r"[\w.=,\[\]-]+", x) else shlex.quote(x) for x in plain)

@@ -1,4 +1,4 @@
-"""Films of episodes, and the picture of a run's learning."""
+"""Films of episodes, and the picture of a run's learning curve."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -36,7 +36,7 @@ from flowrep.viz.maps import OUTCOME_COLOURS, class_legend, resized, text_bar, t
 from flowrep.viz.overlay import legend_strip, steering, with_steering
 
 LEGEND_S, OUTCOME_S = 3.0, 1.0
-"""How long a film shows its legend before the episode, and the last frame with the outcome."""
+"""Seconds for which a film shows the legend at its start, and the outcome at its end."""
 
 _MOST_TILES = 4  # of a representation that is drawn channel by channel
 _STATUS_PX = 28
@@ -48,23 +48,23 @@ class FilmFrame(NamedTuple):
 
     maps: dict[str, Tensor]  # [C, H, W] by tile; ids, metres or px per step
     steps: int  # of the episode so far
-    turned: float  # the yaw rate in shares of the largest, positive to the left
-    action: int | None = None  # chosen at this frame; None if unknown, as at the last one
+    turned: float  # the yaw rate over the largest one, positive to the left
+    action: int | None = None  # chosen at this frame; None if unknown, as in the last frame
 
 
 class Film:
-    """An agent in an env of one street, and the pictures of its steps: a tile for each map.
+    """Drives an agent in an env of one street and draws its steps, with a tile for each map.
 
     Maps that the agent reads are drawn as its env's transforms write them, noisy or estimated, with
-    a frame around. The others of rgb, seg, depth, raw, ego and obj are added from exact sensors.
+    a border. The others of rgb, seg, depth, raw, ego and obj are computed from exact sensors.
 
     Args:
-        agent: its policy drives.
-        changes: of the arguments of `make_env`.
+        agent: the agent whose policy drives.
+        changes: arguments of `make_env` to replace.
 
     Attributes:
         env: one street, with its sensors.
-        tiles: what is drawn, by name; remove some to draw less.
+        tiles: the tiles by name; remove some to draw less.
         framed: the names of the tiles that the agent reads.
     """
 
@@ -92,7 +92,7 @@ class Film:
             }
             self.env.append_transform(representation_stack(exact, **context))
         self.framed = [name for name in read if name in self.tiles]
-        # by tile: the key of its map, and the function that converts the map to the tile's units
+        # By tile: the key of its map, and the function that converts the map to the tile's units.
         self._maps = {name: (name, self._in_units(name)) for name in self.tiles}
         for name in read:
             if name not in self._maps:
@@ -106,9 +106,9 @@ class Film:
         options: Mapping[str, Any],
         on_frame: Callable[[TensorDictBase], Any] = lambda tensordict: None,
     ) -> tuple[list[FilmFrame], EpisodeRecord]:
-        """Returns every frame of one greedy episode, and the episode.
+        """Returns the frames of one greedy episode, and its record.
 
-        `options` are of `StreetEnv.reset`; `on_frame` gets the env's TensorDict.
+        `options` are those of `StreetEnv.reset`; `on_frame` gets the env's TensorDict.
         """
         frames: list[FilmFrame] = []
 
@@ -125,14 +125,14 @@ class Film:
         return frames, episode
 
     def frame(self, tensordict: TensorDictBase) -> FilmFrame:
-        """Returns the frame of the env's TensorDict and the street's current state."""
+        """Returns the frame that shows the env's TensorDict and the street's current state."""
         maps = {tile: make(tensordict[key][0].cpu()) for tile, (key, make) in self._maps.items()}
         episode, vehicle = self.street.episode, self.street.scene.vehicle
         turned = episode.now.vehicle.yaw_rate_rps / math.radians(vehicle.max_yaw_rate_dps)
         return FilmFrame(maps, episode.steps, turned)
 
     def draw(self, frame: FilmFrame, ended: EpisodeRecord | None = None) -> Image:
-        """Returns a frame's picture; an episode in `ended` says how it ended."""
+        """Returns a frame's picture, with the outcome of the episode if it has `ended`."""
         tiles = dict(self.tiles)
         if "rgb" in tiles:
             sign = 0.0 if frame.action is None else YAW_SIGN[frame.action]
@@ -147,7 +147,7 @@ class Film:
         return _above(drawn, f"{frame.steps / self.street.frame_rate_hz:.1f} s   {action}")
 
     def legend(self) -> Image:
-        """Returns a picture of the frames' size that explains them."""
+        """Returns a picture, as large as the frames' pictures, that explains them."""
         classes = self.street.scene.categories
         keys = {"rgb": steering(0.3, 1.0), "seg": class_legend(classes, self._tile_size[1])}
         drawn = legend_strip(
@@ -159,7 +159,7 @@ class Film:
         return _above(drawn, f"{name} reads none of these maps")
 
     def pictures(self, frames: Sequence[FilmFrame], episode: EpisodeRecord) -> Iterator[Image]:
-        """Yields the pictures of a film: the legend, the episode, and how it ended."""
+        """Yields the pictures of a film: the legend, the episode, and its outcome."""
         yield from repeat(self.legend(), max(1, round(LEGEND_S * episode.fps)))
         yield from map(self.draw, frames[:-1])
         last = self.draw(frames[-1], episode)
@@ -178,7 +178,7 @@ class Film:
         return tile._replace(draw=draw)
 
     def _options(self, name: str) -> dict[str, Any]:
-        if name not in REPRESENTATIONS:  # a user's own, whose options may mean anything
+        if name not in REPRESENTATIONS:  # a user's transform, whose options may mean anything
             return {}
         given = self.agent.config.representations.get(name) or {}
         return representation_options(name) | dict(given)
@@ -188,7 +188,7 @@ class Film:
         options = self._options(name)
         if "encoding" in options:
             return lambda ids: ids if len(ids) == 1 else ids.argmax(0, keepdim=True).byte()
-        if "range_m" in options:  # 1 is at or beyond the range, as the sky is
+        if "range_m" in options:  # 1 is the range or beyond it, like the sky
             return lambda depth: torch.where(depth < 1, depth * options["range_m"], torch.inf)
         if name in FLOWS:
             return lambda flow: flow / options["scale"]
@@ -216,7 +216,7 @@ class Film:
 def record_episode(
     agent: Driver, path: Path, *, episode_seed: int, **changes: Any
 ) -> EpisodeRecord:
-    """Writes the film of one greedy episode; `changes` are of the arguments of `make_env`."""
+    """Writes the film of one greedy episode, and returns its record; for `changes` see `Film`."""
     with closing(Film(agent, **changes)) as film:
         frames, episode = film.drive({"episode_seed": episode_seed})
         pictures = film.pictures(frames, episode)
@@ -236,7 +236,7 @@ def how_it_ended(episode: EpisodeRecord) -> str:
 def _picture_scale(agent: Driver) -> int:
     """Returns the factor from the maps' size to that of rgb.
 
-    rgb is rendered at the size of a tile unless the agent reads it. Estimators of flow get
+    rgb is rendered at the size of a tile, unless the agent reads it. Estimators of flow get
     pictures of the config's size in any case.
     """
     config = agent.config
@@ -254,7 +254,7 @@ def _plain(spec: Any) -> Callable[[Any], Image]:
 
 
 def _above(picture: Image, text: str, colour: str = "#ffffff") -> Image:
-    """Returns a picture above a line of text on a bar of a colour."""
+    """Returns a picture with a coloured bar below it, which shows a line of text."""
     background: Any = tuple(bytes.fromhex(colour[1:]))
     grey = 255 if sum(background) < 400 else 40
     bar = text_bar(
@@ -274,10 +274,10 @@ def draw_learning_curve(
     """Draws a run's success over frames, from the rows of metrics.csv and evaluation.csv.
 
     The line is the success rate over the last training episodes (sampled actions); the points are
-    the run's own greedy evaluations at its speed and frame rate, with 95 % Wilson intervals. If a
+    the run's greedy evaluations at its speed and frame rate, with 95 % Wilson intervals. If a
     training evaluation and the final one share a frame count, only the final one is drawn.
     """
-    from matplotlib.figure import Figure  # a tenth of the time that a command takes to start
+    from matplotlib.figure import Figure  # the import takes a tenth of a command's start
 
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.add_subplot(

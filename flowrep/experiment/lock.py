@@ -1,4 +1,4 @@
-"""The lock of a run's folder: one process at a time works in it."""
+"""The lock of a run's folder, in which only one process at a time works."""
 
 import errno
 import fcntl
@@ -17,7 +17,7 @@ from flowrep.files import naming
 
 
 class RunFolderError(ValueError):
-    """A folder is not that of a run, or holds a run where none is wanted."""
+    """A folder holds no run, or holds one where a new run should begin."""
 
 
 class FolderInUseError(OSError):
@@ -35,7 +35,7 @@ class FolderLock:
 
     def __init__(self, folder: Path) -> None:
         self._path, self._text = folder / ".lock", b""
-        # a link is refused, and a named pipe does not block until its other end is opened
+        # O_NOFOLLOW refuses links; with O_NONBLOCK, a named pipe doesn't wait for its other end.
         flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
         try:
             self._file = os.open(self._path, flags, 0o666)
@@ -46,7 +46,9 @@ class FolderLock:
                 raise
             is_plain = False
         if not is_plain:
-            raise RunFolderError(f"'{self._path}' is a link or no file; no run made it: remove it")
+            raise RunFolderError(
+                f"'{self._path}' is a link, or not a regular file; no run creates such: remove it"
+            )
 
     def take(self, doing: str) -> bool:
         """Locks the file; returns False if another process holds it."""
@@ -72,7 +74,7 @@ class FolderLock:
         return True
 
     def check(self) -> None:
-        """Checks that no other process can have taken the folder since."""
+        """Raises RunFolderError if another process may have taken the folder since."""
         if not (self._is_at_its_path() and self._is_ours()):
             raise RunFolderError(
                 f"'{self._path}' was removed or replaced, so another process can take the folder: "
@@ -82,9 +84,9 @@ class FolderLock:
     def holder(self) -> str:
         """Describes the process that wrote the file; empty if that process has ended."""
         try:
-            told = json.loads(os.pread(self._file, 4096, 0))
-            pid, host = int(told["pid"]), told["host"]
-            text = f"process {pid} on {host} has been {told['doing']} in it since {told['since']}"
+            entry = json.loads(os.pread(self._file, 4096, 0))
+            pid, host = int(entry["pid"]), entry["host"]
+            text = f"process {pid} on {host} has been {entry['doing']} in it since {entry['since']}"
         except (ValueError, KeyError, TypeError):  # empty, or written by something else
             return ""
         if host == platform.node() and not _is_alive(pid):
@@ -104,7 +106,7 @@ class FolderLock:
             return False
 
     def _is_ours(self) -> bool:
-        # on a disk without locks, another process may have written to the file since
+        # On a disk without locks, another process may have written to the file since.
         return os.pread(self._file, len(self._text) + 1, 0) == self._text
 
 
@@ -113,7 +115,7 @@ def _is_alive(pid: int) -> bool:
         os.kill(pid, 0)
     except (ProcessLookupError, OverflowError):
         return False
-    except PermissionError:  # it is another user's
+    except PermissionError:  # of another user
         pass
     return True
 
@@ -122,7 +124,8 @@ def _is_alive(pid: int) -> bool:
 def locked(folder: Path, doing: str, patience_s: float = 0.0) -> Iterator[FolderLock]:
     """Locks a folder against other processes until the context, or the process, ends.
 
-    Waits `patience_s` for another process to release it. `doing` tells others what this one does.
+    Waits `patience_s` for another process to release it. `doing` is what this process does, for the
+    error message in other processes.
     """
     until = time.monotonic() + patience_s
     while True:
@@ -131,7 +134,7 @@ def locked(folder: Path, doing: str, patience_s: float = 0.0) -> Iterator[Folder
                 yield lock
                 return
             if time.monotonic() >= until:
-                holder = lock.holder() or "another process has just begun in it"
+                holder = lock.holder() or "another process has just taken it"
                 raise FolderInUseError(
                     f"'{folder}' is in use: {holder}. Wait until it has ended, or stop it"
                 )

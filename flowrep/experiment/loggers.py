@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class Loggers:
-    """TensorBoard in a run's folder, and wandb if it was asked for."""
+    """Logs to TensorBoard in a run's folder and, after `add_wandb`, to Weights & Biases."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -30,7 +30,7 @@ class Loggers:
     def log(self, frames: int, values: Mapping[str, float]) -> None:
         """Logs values by title."""
         events = self._folder / "tensorboard"
-        if not events.is_dir():  # not yet, or somebody removed it, and its writer would fail
+        if not events.is_dir():  # new, or somebody removed it, so that the old writer would fail
             self._tensorboard = None
         with naming(events):
             if self._tensorboard is None:
@@ -44,7 +44,8 @@ class Loggers:
         """Logs shares of outcomes, mean return and mean length, by scene, condition and policy."""
         values: dict[str, list[float]] = defaultdict(list)
         for each in records:
-            kind = each.evaluation.replace("training", "evaluation")  # training has scalars too
+            # "training" would be taken for the episodes from which the agent learns.
+            kind = each.evaluation.replace("training", "evaluation")
             title = "/".join((kind, each.scene, each.speed, f"{each.fps:g}fps", each.policy))
             for name in OUTCOMES:
                 values[f"{title}/{name}"].append(each.outcome == name)
@@ -60,7 +61,7 @@ class Loggers:
     def add_wandb(self, mode: str, config: Mapping[str, Any]) -> None:
         """Sends everything logged from now on to Weights & Biases too, unless `mode` is "off".
 
-        A resumed run continues its own wandb run, whose id is kept in the folder.
+        A resumed run continues its wandb run, whose id is in the folder.
         """
         if mode == "off":
             return
@@ -70,7 +71,7 @@ class Loggers:
             replace_text(kept, uuid.uuid4().hex[:12])
         name = kept.read_text(encoding="utf-8")
         if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name):  # it becomes a part of paths
-            raise RunFolderError(f"{kept} holds no id of a wandb run: restore it, or remove it")
+            raise RunFolderError(f"{kept} does not hold a wandb run's id: restore or remove it")
 
         from torchrl.record.loggers.wandb import WandbLogger
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from flowrep.config.schema import TrainConfig
 
 OUTCOMES = ("success", "collision", "out_of_bounds", "timeout")
-"""How an episode can end. Written out, as the simulator that defines them imports PyTorch."""
+"""How an episode can end. Repeated here, since `flowrep.envs`, which defines it, needs PyTorch."""
 
 CAUSES = ("out of bounds", "collision: pedestrian", "collision: other", "timeout")
 _FAILURE_GROUP = (
@@ -35,45 +35,45 @@ _FAILURE_GROUP = (
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeRecord:
-    """One evaluated episode. Its fields but the last are the columns of evaluation.csv."""
+    """One evaluated episode. All fields but the last are the columns of evaluation.csv."""
 
-    # which agent drove; known to the agent, not to the loop that drives
+    # The agent; `evaluate` leaves these empty, and `PairedEvaluation.records` fills them in.
     scene: str = ""
     scene_id: str = ""  # a hash of all that defines the scene
     representations: str = ""  # "ego+obj"
     flow: str = ""  # "exact" or "estimated"
     seed: int | str = ""  # of the agent's run; "" for a policy without one
-    frames: int = 0  # that the agent was trained for
+    frames: int = 0  # of the agent's training
     evaluation: str = ""  # "training", "final" or "evaluate"
     policy: str = ""  # "greedy", "sampled", or the name of another policy
-    # under which conditions
+    # The conditions.
     speed: str  # the pedestrians' speed mode; "" for the env's default
     fps: float
     episode_seed: int  # determines path and people, see `StreetEnv.reset`
-    path: str  # the name of the scene's path that the episode drew, or was given
-    # and how it ended
+    path: str  # the name of the scene's path that the episode drew or was given
+    # How it ended.
     outcome: str  # one of `OUTCOMES`
     hit: str  # the category that was hit, or ""
     return_: float  # undiscounted sum of rewards
     length: int  # the number of steps T
-    # of the vehicle, x and y in metres, `[T + 1, 2]`; kept in drives.npz
+    # The vehicle's x and y in metres, `[T + 1, 2]`; stored in drives.npz.
     positions: NDArray[np.float32] = field(repr=False, compare=False)
 
     def row(self) -> dict[str, Any]:
-        """Returns its cells in evaluation.csv by column."""
+        """Returns the episode's row in evaluation.csv, by column."""
         row = {column: getattr(self, name) for column, name in _FIELDS.items()}
         return row | {"return": round(self.return_, 4)}
 
 
-# `return` can't be the name of a field
+# A field can't be named `return`.
 _FIELDS = {each.name.rstrip("_"): each.name for each in fields(EpisodeRecord)[:-1]}
 EVALUATION_COLUMNS = tuple(_FIELDS)
 
-_LATER = ("scene_id", "path")  # columns that older tables lack; their cells are read as empty
+_LATER = ("scene_id", "path")  # columns that older tables lack; they are read as empty
 _CHECKS: dict[str, Callable[[str], Any]] = {
     "frames": int, "fps": float, "outcome": OUTCOMES.index,
 }  # fmt: skip
-"""Of cells in evaluation.csv: a misspelt outcome would count as a failure."""
+"""How cells of evaluation.csv are checked: a misspelt outcome would count as a failure."""
 
 
 def read_episodes(path: Path) -> list[dict[str, str]]:
@@ -91,7 +91,7 @@ def is_finished(folder: Path, config: TrainConfig) -> bool:
 
 
 def success_of(folder: Path) -> float:
-    """Returns the success of a run's greedy policy in its last final evaluation, nan without."""
+    """Returns the greedy policy's success in a run's last final evaluation, or nan."""
     greedy = [row for row in _final(folder) if row["policy"] == "greedy"]
     last = max((int(row["frames"]) for row in greedy), default=0)
     ends = [row["outcome"] for row in greedy if int(row["frames"]) == last]
@@ -107,13 +107,13 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tu
     """Returns Wilson's score interval of a proportion; (0, 1) without trials."""
     if not trials:
         return 0.0, 1.0
-    # the proportions p from which the observed share is at most z standard errors away: the
-    # solutions of (share - p)² = z² p (1 - p) / trials
+    # The interval holds the proportions p from which the observed share is at most z standard
+    # errors away. Its ends are the solutions of (share - p)² = z² p (1 - p) / trials.
     z2 = NormalDist().inv_cdf(0.5 + confidence / 2) ** 2
     share = successes / trials
     centre = (share + z2 / (2 * trials)) / (1 + z2 / trials)
     half = (z2 * share * (1 - share) / trials + z2**2 / (4 * trials**2)) ** 0.5 / (1 + z2 / trials)
-    # rounding may leave an end an ulp on the wrong side of the share, or outside of [0, 1]
+    # Rounding may leave an end an ulp on the wrong side of the share, or outside of [0, 1].
     return max(0.0, min(share, centre - half)), min(1.0, max(share, centre + half))
 
 
@@ -181,7 +181,7 @@ def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     for name in rows[0]:
         heading = name.replace("_", " ").replace(": ", ":\n")
         is_number = all(str(row[name])[:1] in "-0123456789" for row in rows)
-        # a policy's name may be a long path: it is folded, numbers are not
+        # A policy's name may be a long path, which is wrapped; numbers are not.
         table.add_column(
             heading,
             no_wrap=name != "policy",
@@ -190,6 +190,6 @@ def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
         )
     for row in rows:
         table.add_row(*map(str, row.values()))
-    # names are text: a[b] is no markup, :car: no emoji
+    # Names are plain text: a[b] is no markup, :car: no emoji.
     console = Console(width=max(100, Console().width), markup=False, emoji=False)
     console.print(table)

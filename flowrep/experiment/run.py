@@ -1,7 +1,7 @@
 """A run's folder: its config, tables of metrics and episodes, and checkpoint.
 
-Commands look for the folders that they are given before they import PyTorch, and so does a report:
-what needs it is imported where it is used.
+Commands open the folders that they are given before they import PyTorch, so here only the functions
+that need it import it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import subprocess
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from flowrep import __version__
 from flowrep.config import UsageError
-from flowrep.config.schema import BaselineName, TrainConfig, validated_run
+from flowrep.config.schema import TrainConfig, validated_run
 from flowrep.experiment.lock import FolderLock, RunFolderError, locked
 from flowrep.experiment.loggers import Loggers
 from flowrep.experiment.outcomes import (
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 _EPISODE = ("scene", "scene_id", "frames", "evaluation", "policy", "speed", "fps", "episode_seed")
 """The columns that identify a row of evaluation.csv."""
 _DRIVE = ("scene_id", "evaluation", "frames", "policy", "speed", "fps", "episode_seed", "outcome")
-"""The columns in drives.npz."""
+"""The columns of drives.npz."""
 
 _IDENTITY = (
     "scene", "representations", "flow", "motion", "noise", "algorithm", "speed", "seed", "num_envs",
@@ -52,28 +52,13 @@ _IDENTITY = (
 def origin_of(config: Mapping[str, Any]) -> dict[str, Any]:
     """Returns the identity of a run: flowrep's version, and the config keys that define it."""
     parts = json.loads(json.dumps({key: config[key] for key in _IDENTITY}))
-    parts["scene"].pop("symmetric", None)  # read by configs that choose images, and by no street
+    # It is only for presets that choose `algorithm.mirror`; no street depends on it.
+    parts["scene"].pop("symmetric", None)
     return {"flowrep": __version__, **parts}
 
 
-def check_policy(name: str) -> None:
-    """Checks that there is what `policy=` names, as far as that shows without PyTorch."""
-    if Path(name).is_dir() or name in (*get_args(BaselineName), "pretrained"):
-        return
-    script, is_reference, _ = name.rpartition(":")
-    file, ends = (script, (".py",)) if is_reference else (name, (".pt2", ".safetensors"))
-    if file.endswith(ends):
-        if not Path(file).is_file():
-            raise UsageError(f"policy={name}: there is no file '{file}'")
-    elif not is_reference:
-        raise UsageError(
-            f"policy={name}: give {', '.join(get_args(BaselineName))}, pretrained, a run's folder, "
-            "path.safetensors, path.py:make, package.module:make or path.pt2"
-        )
-
-
 def machine_of(precision: torch.dtype) -> dict[str, Any]:
-    """Returns what computes a run: versions, commit, processor and number format."""
+    """Returns versions, commit, processor and number format, which may change a run's numbers."""
     import torch
 
     home, commit = Path(__file__).parents[2], None
@@ -166,7 +151,7 @@ class RunFolder:
         self.path.mkdir(parents=True, exist_ok=True)
 
     def video_path(self, name: str) -> Path:
-        """The file for a video of that name."""
+        """Returns the path of the video with this name."""
         return self.path / "videos" / f"{name}.mp4"
 
     def begin(self, config: TrainConfig, overrides: Iterable[str]) -> TrainConfig:
@@ -258,17 +243,17 @@ class RunFolder:
     def log_episodes(self, records: Sequence[EpisodeRecord], *, drives: bool = False) -> None:
         """Saves evaluated episodes, and logs their means to TensorBoard and wandb.
 
-        `drives` keeps where the vehicle was in each.
+        With `drives`, the vehicle's positions are saved, too.
         """
-        self.save_episodes(records)  # first: they took hours, and drives are only for pictures
+        self.save_episodes(records)  # first: they took hours, and positions are only for pictures
         if drives:
             self._save_drives(records)
         self.loggers.log_episodes(records)
 
     def save_episodes(self, records: Iterable[EpisodeRecord]) -> None:
-        """Adds evaluated episodes to evaluation.csv, in place of earlier rows of the same ones.
+        """Adds evaluated episodes to evaluation.csv, in place of earlier rows of the same episodes.
 
-        They go to the end, so the same evaluation, run again, leaves the same file.
+        They go to the end, so that running the same evaluation again results in the same file.
         """
         self._prepare()
         new = [{name: str(cell) for name, cell in each.row().items()} for each in records]
@@ -277,7 +262,7 @@ class RunFolder:
         write_rows(self.evaluation_path, [*kept, *new], EVALUATION_COLUMNS)
 
     def _save_drives(self, records: Iterable[EpisodeRecord]) -> None:
-        """Adds where vehicles drove to drives.npz, in place of the same episodes' earlier drives.
+        """Adds the vehicles' positions to drives.npz; they replace those of the same episodes.
 
         It holds `positions` [sum of T + 1, 2], x and y in metres; `starts` [N + 1], so that episode
         n is `positions[starts[n]:starts[n + 1]]`; and the columns that name each episode.
@@ -290,7 +275,7 @@ class RunFolder:
         replace_file(self.drives_path, lambda path: np.savez_compressed(path, **arrays))
 
     def _read_drives(self) -> dict[tuple[Any, ...], NDArray[np.float32]]:
-        """Returns the drives in drives.npz by what identifies them; sets a damaged file aside."""
+        """Returns positions in drives.npz by the episodes' columns; sets a damaged file aside."""
         if not self.drives_path.is_file():
             return {}
         try:
@@ -303,7 +288,7 @@ class RunFolder:
             return {}
 
     def write_failures(self) -> None:
-        """Writes the causes of failure in evaluation.csv, in place of an older table."""
+        """Writes the causes of the failures in evaluation.csv to failures.csv."""
         write_rows(self.failures_path, failure_causes(self.read_episodes()))
 
 

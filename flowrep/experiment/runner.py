@@ -1,4 +1,4 @@
-"""A run from its start, or its checkpoint, to its last evaluation."""
+"""The loop of a run: training from its start or its checkpoint, evaluation and film."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ FINAL_SEED = 1_500_000  # not the episodes evaluated during training
 class Runner:
     """Holds the env, the agent, the folder and the clock of a run; `train` is its loop.
 
-    `state` and `load` are its checkpoint: all that the rest of the run depends on.
+    `save` and `load` write and read its checkpoint: all that the rest of the run depends on.
     """
 
     def __init__(
@@ -57,12 +57,12 @@ class Runner:
         torch.manual_seed(config.seed)
         self.env = build.env(config, compiled=config.compiled)
         self.env.set_seed(config.seed * config.num_envs)
-        # TorchRL's storage starts multiprocessing's resource tracker, which a hang-up would end
+        # TorchRL's storage starts multiprocessing's resource tracker, which a SIGHUP would end.
         with sheltered():
             self.agent = build.agent(config, self.env)
-        self.frames = 0  # of the environment, so far
-        self.observation: TensorDictBase | None = None  # what is acted on next
-        self.evaluation_pending = False  # whether a stop cut the last one short
+        self.frames = 0  # of all envs, so far
+        self.observation: TensorDictBase | None = None  # for the next action
+        self.evaluation_pending = False  # whether a stop interrupted the last one
         self.metrics, self.recent = Means(), RecentEpisodes()
 
     def train(self, stop: StopRequest) -> None:
@@ -155,8 +155,8 @@ class Runner:
     def evaluate(self, kind: str, stop: StopRequest) -> bool:
         """Adds episodes to evaluation.csv; returns whether all were run before a stop.
 
-        The kind is "training", greedy ones at the training speed, or "final", at each speed and
-        frame rate, beside the baselines.
+        `kind` is "training", greedy episodes at the training's speed, or "final", episodes at each
+        speed and frame rate, also of the baselines.
         """
         config, asked, fps = self.config, self.config.evaluation, self.env.base_env.frame_rate_hz
         if kind == "final":
@@ -177,7 +177,7 @@ class Runner:
         return True
 
     def film(self) -> None:
-        """Writes causes of failure and the learning curve, and films an episode unless done."""
+        """Writes causes of failure and the learning curve; films an episode if none is filmed."""
         # drawing takes seconds to import
         from flowrep.experiment.film import draw_learning_curve, record_episode
         from flowrep.viz import is_playable
@@ -195,10 +195,10 @@ class Runner:
             print(f"video: {path}")
 
     def close(self) -> None:
-        """Ends the worker processes of the envs, and writes what loggers still hold."""
+        """Ends the envs' worker processes, and flushes the loggers."""
         if not self.env.is_closed:
             self.env.close()
-        with suppress(OSError):  # of TensorBoard alone: the tables have the same numbers
+        with suppress(OSError):  # only TensorBoard lacks numbers then; the tables have them
             self.folder.loggers.flush()
 
     def check(self) -> None:
@@ -248,7 +248,7 @@ class Runner:
         self.folder.forget_after(self.frames)
 
     def state(self) -> dict[str, Any]:
-        """Returns all that the rest of the run depends on: nested plain data and tensors."""
+        """Returns all that the rest of the run depends on, as nested plain data and tensors."""
         assert self.observation is not None
         return {
             "origin": origin_of(self.config.plain()),
@@ -291,7 +291,7 @@ class RecentEpisodes:
         after = stepped["next"]
         rewards = after["reward"].flatten().double()
         step = torch.stack([rewards, torch.ones_like(rewards)])
-        # not in place: restored sums are on the CPU, the env may be on a GPU
+        # Not in place: restored sums are on the CPU, the env may be on a GPU.
         self._running = self._running.to(step.device) + step
         done = after["done"].flatten()
         outcomes = after["outcome"].flatten()[done].tolist()
@@ -329,7 +329,7 @@ class Means:
     def add(self, metrics: Mapping[str, Tensor]) -> None:
         """Adds the metrics of one update."""
         for name, value in metrics.items():
-            # not in place: restored sums are on the CPU, and a CUDA graph reuses its tensors
+            # Not in place: restored sums are on the CPU, and a CUDA graph reuses its tensors.
             self._sums[name] = self._sums.get(name, 0) + value.detach()
         self._count += 1
 

@@ -37,9 +37,9 @@ cli.register_resolvers()  # for the paths in conf/run_folder.yaml, which a worke
 
 LOG = "job.log"
 STOP = ".stop_"
-"""How the name of the file begins that tells a sweep's jobs, on any machine, to save and stop.
+"""Prefix of the name of a file that makes a sweep's jobs, on any machine, save and stop.
 
-It ends with the sweep's id, as two sweeps may share a folder. Jobs get the id as `SWEEP_ID` in
+The sweep's id follows, as two sweeps may share a folder. Jobs get the id as `SWEEP_ID` in
 `hydra.job.env_set`.
 """
 SWEEP_ID = "FLOWREP_SWEEP"
@@ -50,9 +50,9 @@ TRAIN = (sys.executable, "-m", "flowrep.train")
 FINISHED, FAILED, STOPPED = "finished", "failed", "stopped"
 _ONLY_SHOWS = {"--cfg", "-c", "--info", "-i", "--help", "-h", "--hydra-help", "--version"}
 _NEEDED_BY = {
-    # finished jobs take no time, so batches would grow and delay the unfinished ones
+    # Finished jobs take no time, so batches would grow and delay the unfinished ones.
     "hydra/launcher=joblib": ("hydra.launcher.batch_size=1",),
-    # a run returns its success, and a failed run should not end the study
+    # A run returns its success, and a failed run should not end the study.
     "hydra/sweeper=optuna": (
         "hydra.sweeper.direction=maximize",
         "hydra.sweeper.max_failure_rate=1.0",
@@ -66,7 +66,7 @@ class RunFailedError(RuntimeError):
 
 
 def is_sweep(arguments: list[str]) -> bool:
-    """Returns whether a command line asks for several runs, and not only shows their config."""
+    """Returns whether a command line starts several runs, rather than only showing their config."""
     given = {"-m", "--multirun", "hydra.mode=MULTIRUN"} & {*arguments}
     return bool(given) and not _ONLY_SHOWS & {*arguments}
 
@@ -76,7 +76,7 @@ def run_sweep() -> NoReturn:
     keys = {text.partition("=")[0] for text in sys.argv[1:]}
     if "resume" in keys:
         cli.exit_with(
-            "resume= continues one run; continue a sweep with its own command and "
+            "resume= continues one run; to continue a sweep, repeat its command with "
             "hydra.sweep.dir=<its folder>"
         )
     typed = [text for text in sys.argv[1:] if not text.startswith("hydra.sweep.dir=")]
@@ -87,7 +87,7 @@ def run_sweep() -> NoReturn:
     given = cli.override("hydra.sweep.dir", str(folder))
     needed = [option for choice in typed for option in _NEEDED_BY.get(choice, ())]
     needed = [option for option in needed if option.partition("=")[0] not in keys]
-    # argparse wants all overrides side by side, and flags with values may stand around them
+    # argparse needs all overrides side by side, and flags with values may surround them.
     are_keys = ["=" in text and not text.startswith("-") for text in typed]
     at = are_keys.index(True) if True in are_keys else len(typed)
     added = [given, *needed, f"+hydra.job.env_set.{SWEEP_ID}={sweep_id}"]

@@ -1,4 +1,4 @@
-"""A window in which a policy drives, or a person with the arrow keys."""
+"""A window in which a policy drives, or a person by the arrow keys."""
 
 import time
 from collections import deque
@@ -17,17 +17,17 @@ from flowrep.scenes.vehicle import NO_OP, TURN_LEFT, TURN_RIGHT
 
 
 class NewEpisode(Exception):
-    """The driver skips the rest of the episode."""
+    """The person skips the rest of the episode."""
 
 
 class Keyboard:
-    """A policy that acts by the keys that are held, or hands over to another policy.
+    """A policy that acts by the arrow keys that are held down, or hands over to another policy.
 
     Both arrow keys together cancel out.
 
     Args:
-        other: the policy that drives after a press of S.
-        name: of that policy, for the window's title.
+        other: the policy that drives after S is pressed.
+        name: the name of that policy, for the window's title.
     """
 
     ACTIONS = {"left": TURN_LEFT, "right": TURN_RIGHT}  # noqa: RUF012 - never changed
@@ -71,7 +71,7 @@ def drive_by_hand(
     """Opens a window and drives one episode after the other until it is closed.
 
     The last frame of an episode stays in view until R begins the next one, with the next seed.
-    `pause` draws and handles keys for some seconds; by default that of a window on the screen.
+    `pause` draws and handles keys for some seconds; by default, it is Matplotlib's.
     """
     import matplotlib.pyplot as plt
 

@@ -59,6 +59,8 @@ def refusal(command, model, line):
         "+representations.rgb=null",
         "noise.depth_dropout=1.5",
         "flow.estimator=abc flow=estimated",
+        "flow.estimator=raft_small flow=estimated",  # without weights
+        "flow.weights=raft.pth flow=estimated",  # which dis doesn't have
         # keys
         "~seed",
         "+algorithm.gama=0.9",
@@ -68,6 +70,7 @@ def refusal(command, model, line):
         "algorithm.learning_starts=4991 total_frames=5000",
         "algorithm.batch_size=31",
         "algorithm.rollout_length=64 algorithm=ppo total_frames=2047",
+        "algorithm.batch_size=2049 algorithm=ppo",
     ],
 )
 def test_a_value_that_can_not_be_is_named(line):
