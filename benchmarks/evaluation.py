@@ -1,9 +1,9 @@
-"""Episodes per second of an evaluation on one core, and what a step spends its time on.
+"""Episodes per second of an evaluation on one core, and how long each part of a step takes.
 
     python benchmarks/evaluation.py [--scene straight_road] [--maps ego obj] [--num-envs 32 96]
 
-The agent costs as much as a trained network but always drives straight on, so that the episodes are
-the same whatever is measured. The batch sizes take turns. Times are CPU times.
+The agent costs as much as a trained network but always drives straight on, so that all measurements
+are of the same episodes. The batch sizes take turns. Times are CPU times.
 """
 
 import argparse
@@ -48,7 +48,7 @@ class StraightOn:
 def measured(
     scene: Scene, maps: list[str], policy: Policy, num_envs: int, episodes: int
 ) -> dict[str, float]:
-    """Returns CPU seconds of an evaluation, by part and for making its env, and its steps."""
+    """Returns CPU seconds by part, for making the env and for all, and the number of steps."""
     spent: Counter[str] = Counter()
 
     def timed(name: str, call: Callable[..., Any]) -> Callable[..., Any]:
@@ -65,8 +65,8 @@ def measured(
     env = make_env(scene, maps, num_envs=num_envs)
     made = time.process_time()
     options = [{"episode_seed": FIRST_SEED + k, "speed": "normal"} for k in range(episodes)]
-    # A step of the TransformedEnv contains the GymWrapper's, which drives and draws the streets;
-    # the rest of it is the representations'.
+    # A step of the TransformedEnv contains the GymWrapper's, which drives and draws the streets.
+    # The rest of it computes the representations.
     parts = {"streets": (GymWrapper, "_step"), "env": (TransformedEnv, "_step")}
     with ExitStack() as stack:
         for name, (owner, method) in (parts | {"act": (StraightOn, "__call__")}).items():
@@ -75,7 +75,7 @@ def measured(
         steps = sum(episode.length for episode in evaluate(env, policy, options))
     ended = time.process_time()
     env.close()
-    spent["see"] = spent.pop("env") - spent["streets"]
+    spent["represent"] = spent.pop("env") - spent["streets"]
     return {**spent, "make": made - started, "run": ended - made, "steps": steps}
 
 
@@ -100,15 +100,18 @@ def main() -> None:
         for _ in range(args.rounds)
     ]
     print(f"{args.episodes} episodes in {args.scene}, {args.size} px, {'+'.join(args.maps)}")
-    print("| num_envs | episodes/s | ms per step | streets | see | act | rest | make env, s |")
+    print(
+        "| num_envs | episodes/s | ms per step | streets | represent | act | rest | make env, s |"
+    )
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     for num_envs, runs in zip(args.num_envs, zip(*rounds)):
-        best = {key: statistics.median(run[key] for run in runs) for key in runs[0]}
-        parts = [1e3 * best[key] / best["steps"] for key in ("run", "streets", "see", "act")]
+        median = {key: statistics.median(run[key] for run in runs) for key in runs[0]}
+        names = ("run", "streets", "represent", "act")
+        parts = [1e3 * median[name] / median["steps"] for name in names]
         rest = parts[0] - sum(parts[1:])
-        rate = args.episodes / (best["run"] + best["make"])
+        rate = args.episodes / (median["run"] + median["make"])
         cells = " | ".join(f"{part:.3f}" for part in (*parts, rest))
-        print(f"| {num_envs} | {rate:.1f} | {cells} | {best['make']:.2f} |")
+        print(f"| {num_envs} | {rate:.1f} | {cells} | {median['make']:.2f} |")
 
 
 if __name__ == "__main__":

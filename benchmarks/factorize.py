@@ -1,13 +1,12 @@
 """Times `factorize` beside the same maths composed from kornia, and a copy of the same bytes.
 
-Bounds, compiled on the CPU: at least 30 x kornia, and 70 % of the machine's copy bandwidth at
-28 bytes a pixel (raw and depth read, ego and obj written; the mask's byte is not counted). The
-contenders take turns, so that all run under the same load; a ratio is the median over the turns.
-Freed memory is kept in the process for all of them, as in training; otherwise page faults would
-dominate.
+Bounds for the compiled function on a CPU: 30 times as fast as kornia, and 70 % of the machine's
+copy bandwidth at 28 bytes per pixel (raw and depth are read, ego and obj written; the mask's byte
+is not counted). All take turns, so that they run under the same load; a ratio is the median over
+the turns. The process keeps freed memory, as in training; otherwise page faults would dominate.
 
-A table follows: factorize, compiled with a dynamic batch, at batch 1 to 4096 and both sizes, as
-memory permits. `--device cuda` runs only that table on a GPU.
+Then comes a table of `factorize`, compiled with a dynamic batch, for batches of 1 to 4096 and both
+sizes, as far as memory suffices. `--device cuda` prints only that table, of a GPU.
 
 python benchmarks/factorize.py --rounds 40
 python benchmarks/factorize.py --device cuda
@@ -41,11 +40,11 @@ def main() -> None:
     parser.add_argument(
         "--cpu-time",
         action="store_true",
-        help="one thread, and CPU seconds instead of the wall's: for a machine that is in use",
+        help="one thread, and CPU time instead of wall time: for a busy machine",
     )
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
     parser.add_argument(
-        "--memory-gib", type=float, help="that the table may use; half of what is free by default"
+        "--memory-gib", type=float, help="for the table; by default half of the free memory"
     )
     args = parser.parse_args()
     torch.set_grad_enabled(False)
@@ -69,7 +68,7 @@ def cuda_clock() -> float:
 def sweep(
     device: torch.device, memory_gib: float | None, rounds: int, clock: Callable[[], float]
 ) -> None:
-    """Prints a row for each batch that fits into memory."""
+    """Prints a table with a row for each batch size that fits into memory."""
     limit = free_bytes(device) / 2 if memory_gib is None else memory_gib * 2**30
     threads = f"{torch.get_num_threads()} CPU threads"
     name = torch.cuda.get_device_name() if device.type == "cuda" else threads
@@ -81,8 +80,8 @@ def sweep(
     for height, width in SWEEP_SIZES:
         for batch in SWEEP_BATCHES:
             pixels = batch * height * width
-            # Inputs and outputs, and 20 bytes a pixel for the previous call's results, whose memory
-            # may not be free yet.
+            # Inputs and outputs, and 20 bytes per pixel for the previous call's results, which may
+            # not be freed yet.
             needed = pixels * (BYTES_PER_PIXEL + 20)
             if needed > limit:
                 print(
@@ -102,7 +101,7 @@ def row(
     rounds: int,
     clock: Callable[[], float],
 ) -> None:
-    """Prints the time of one batch; the copy takes turns with it."""
+    """Prints the time of one batch size, measured in turns with the copy."""
     batch, height, width = shape
     given = [tensor.to(device) for tensor in inputs(batch, height, width)]
     calls = {"factorize": lambda: compiled(*given), "copy": copy}
@@ -129,7 +128,7 @@ def free_bytes(device: torch.device) -> int:
     for line in Path("/proc/meminfo").read_text().splitlines():
         if line.startswith("MemAvailable:"):
             return 1024 * int(line.split()[1])
-    raise RuntimeError("no MemAvailable in /proc/meminfo; say --memory-gib")
+    raise RuntimeError("no MemAvailable in /proc/meminfo; give --memory-gib")
 
 
 def compare(batch: int, height: int, width: int, rounds: int, clock: Callable[[], float]) -> None:
@@ -173,10 +172,7 @@ def report(size: str, moved_bytes: int, turns: dict[str, list[float]]) -> None:
         f"  and at {100 * large:.0f} % of the machine's copy bandwidth; bound "
         f"{100 * COPY_BOUND:g} %: {verdict(large >= COPY_BOUND)}"
     )
-    print(
-        f"  and at {100 * same:.0f} % of a copy of the same bytes, which stay in the cache "
-        "where it holds them"
-    )
+    print(f"  and at {100 * same:.0f} % of a copy of the same bytes, which may stay in the cache")
 
 
 def verdict(held: bool) -> str:
@@ -184,12 +180,12 @@ def verdict(held: bool) -> str:
 
 
 def median_ratio(slow: list[float], fast: list[float]) -> float:
-    # of each turn, in which the machine's load is the same for both
+    # Of the ratios of single turns: within a turn, the machine's load is the same for both.
     return statistics.median(s / f for s, f in zip(slow, fast))
 
 
 def inputs(batch: int, height: int, width: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Returns raw, depth, K and prev_from_curr of a street at 10 m/s and 12 frames/s, in a turn."""
+    """Returns raw, depth, K and prev_from_curr of a turn at 10 m/s and 12 frames/s."""
     generator = torch.Generator().manual_seed(0)
     raw = torch.randn(batch, 2, height, width, generator=generator)
     depth = 2 + 60 * torch.rand(batch, 1, height, width, generator=generator)
@@ -255,7 +251,7 @@ def repeats_for(
 
 
 def timed(call: Callable[[], object], repeats: int, clock: Callable[[], float]) -> float:
-    """Returns seconds a call without the first of the turn, which finds another's data cached."""
+    """Returns seconds per call, without the turn's first call, whose data isn't in the cache."""
     call()
     started = clock()
     for _ in range(repeats):

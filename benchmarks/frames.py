@@ -4,11 +4,11 @@
 
 1. One view: a planner drives, and every view is drawn by both renderers, with all people in place.
 2. A frame of 32 envs in one process with ego and obj and random actions, without policy and replay
-   memory. The rasteriser draws all envs at once, PyBullet each on its own; the two take turns.
+   memory. The rasteriser draws all envs at once, PyBullet one after the other; the two take turns.
 3. Frames per second by number of worker processes, with `--workers 0 1 4`; 0 is this process alone.
 
-The first two are CPU times, so that other work on the machine does not count; the third is by the
-clock. With `--device cuda` only the third runs.
+The first two are CPU times, so that other work on the machine does not count; the third is wall
+time. With `--device cuda` only the third runs.
 """
 
 import argparse
@@ -37,7 +37,7 @@ SENSORS = (*MAPS, "prev_from_curr", "instance_motion")
 
 
 def in_size(name: str, size: int) -> Scene:
-    """Returns a scene whose camera has `size` pixels a side."""
+    """Returns a scene whose camera's picture is `size` pixels high and wide."""
     scene = load_scene(name)
     camera = dataclasses.replace(scene.camera, height_px=size, width_px=size)
     return dataclasses.replace(scene, camera=camera)
@@ -142,8 +142,8 @@ def shares(env: EnvBase, take: Callable[[int], float], steps: int) -> list[float
     for each in patches:
         each.stop()
     frames = steps * env.batch_size.numel()
-    drive, see, represent, _ = (spent[key] / frames for key in owners)
-    return [drive, see, represent, whole - drive - see - represent]
+    drive, sense, represent, _ = (spent[key] / frames for key in owners)
+    return [drive, sense, represent, whole - drive - sense - represent]
 
 
 def worker_row(
@@ -165,8 +165,8 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=scene_names())
     parser.add_argument("--sizes", type=int, nargs="+", default=[84, 48])
     parser.add_argument("--num-envs", type=int, default=32)
-    parser.add_argument("--views", type=int, default=300, help="of each scene and size")
-    parser.add_argument("--steps", type=int, default=10, help="of every env in each round")
+    parser.add_argument("--views", type=int, default=300, help="views of each scene and size")
+    parser.add_argument("--steps", type=int, default=10, help="steps of every env in each round")
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--workers", type=int, nargs="*", default=[])
     parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))
@@ -185,7 +185,7 @@ def main() -> None:
         print(f"\n{args.num_envs} envs in one process, one thread, ms per frame")
         print(
             "| scene | pixels | PyBullet | flowrep | ratio | frames/s "
-            "| drive | see | represent | the rest |"
+            "| drive | sense | represent | rest |"
         )
         print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
         for row in rows:

@@ -1,4 +1,4 @@
-"""A `BulletCamera`'s call beside the bare `getCameraImage` of the same picture.
+"""Times a `BulletCamera`'s call beside PyBullet's `getCameraImage` of the same picture.
 
     python benchmarks/pybullet_camera.py [--sizes 84 240] [--rounds 30]
 

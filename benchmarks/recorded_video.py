@@ -1,9 +1,9 @@
-"""Frames a second of `flowrep.factorize` on a recording of 640 x 480, and its memory over time.
+"""Frames per second of `flowrep.factorize` on a recording of 640 x 480, and its memory over time.
 
-`python benchmarks/recorded_video.py` writes a recording of a textured room, factorises it on one
-core (pictures and flow files written, no video) and prints a breakdown of the time.
-`python benchmarks/recorded_video.py memory` reads and factorises 10,000 small frames and prints the
-memory in use along the way.
+`python benchmarks/recorded_video.py` writes a recording of a textured wall, factorises it on one
+core (pictures and flow files are written, but no video) and prints where the time goes.
+`python benchmarks/recorded_video.py memory` factorises 10,000 small frames and prints the memory in
+use along the way.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ FOCAL_PX, WALL_M = 525.0, 2.5
 
 
 def write_recording(folder: Path, frames: int, height: int, width: int) -> None:
-    """Writes a recording of a camera moving along and towards a wall, as JPEG and 16-bit PNG."""
+    """Writes a recording of a camera that moves in front of a wall, as JPEG and 16-bit PNG."""
     for kind in ("rgb", "depth"):
         (folder / kind).mkdir(parents=True)
     noise = np.random.default_rng(0).integers(0, 256, (96, 128, 3), dtype=np.uint8)
@@ -41,7 +41,7 @@ def write_recording(folder: Path, frames: int, height: int, width: int) -> None:
         pose[:3, 3] = 0.3 * np.sin(i / 9), 0.1 * np.cos(i / 7), 0.3 * np.sin(i / 15)
         poses.append(pose)
         z = WALL_M - pose[2, 3]
-        # The wall's picture has `focal / WALL_M` pixels a metre around its middle.
+        # The texture has `focal / WALL_M` pixels per metre; its middle is at x = y = 0.
         size = z / WALL_M
         left = 2 * width + pose[0, 3] * focal / WALL_M - size * width / 2
         top = 2 * height + pose[1, 3] * focal / WALL_M - size * height / 2
@@ -65,7 +65,7 @@ def measure(
     register: bool = False,
     flow_files: tuple[str, ...] = ("flo",),
 ) -> None:
-    """Prints frames a second of one whole job, by CPU time and by the clock."""
+    """Prints the frames per second of one job, by CPU time and by wall time."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         write_recording(folder / "in", FRAMES, 480, 640)
@@ -127,16 +127,16 @@ def main() -> None:
     if sys.argv[1:] == ["memory"]:
         memory()
         return
-    print(f"{'640 x 480, one core, no video':<44} {'CPU':>6} {'clock':>6}   frames a second")
+    print(f"{'640 x 480, one core, no video':<44} {'CPU':>6} {'wall':>6}   frames per second")
     both = {"check_consistency": True}
     one = {"check_consistency": False}
-    measure("DIS fast, there and back (the default)", "fast", **both)
+    measure("DIS fast, both directions (the default)", "fast", **both)
     measure("the same, no flow files", "fast", **both, flow_files=())
     measure("depth registered to colour (7-Scenes)", "fast", **both, register=True)
-    measure("DIS fast, one way", "fast", **one)
-    measure("DIS medium, one way", "medium", **one)
+    measure("DIS fast, one direction", "fast", **one)
+    measure("DIS medium, one direction", "medium", **one)
     measure("the same, no flow files", "medium", **one, flow_files=())
-    measure("DIS medium, there and back", "medium", **both)
+    measure("DIS medium, both directions", "medium", **both)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""What flow costs beside the rendering of the depth and ids that it is computed from, in Newton.
+"""Compares the cost of flow with that of rendering the depth and ids that it needs, in Newton.
 
     python benchmarks/rendered_flow.py [--worlds 1 16] [--rounds 30]
 
-A step with flow, a step without, and the rendering alone take turns. Times are medians of CPU times
-of one thread; flow's is the difference of the two steps, adapters included.
+A step with flow, a step without it, and the rendering alone take turns. Times are medians of CPU
+times of one thread; flow's is the difference between the two steps, adapters included.
 """
 
 import argparse
@@ -41,7 +41,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=30)
     args = parser.parse_args()
     torch.set_num_threads(1)
-    print(f"{WIDTH} x {HEIGHT} pixels a world")
+    print(f"{WIDTH} x {HEIGHT} pixels per world")
     print("| worlds | rendering | flow | ratio |\n| --- | --- | --- | --- |")
     for worlds in args.worlds:
         print(compare(worlds, args.rounds))

@@ -2,9 +2,9 @@
 
     python benchmarks/training.py [--frames 12_000] [--rounds 2] [--base FOLDER] [overrides ...]
 
-Each variant runs `python -m flowrep.train preset=laptop <overrides>` without evaluations, in turn:
-with all threads, with one, and with all of them beside a busy loop (`--alone`: the first only).
-With `--base`, the same variants of another checkout of flowrep run as well. Rates are of the second
+The variants of `python -m flowrep.train <overrides>` run in turn, without evaluations: updates on
+one thread and on a thread per core, each alone and beside a busy loop (`--alone`: only the first
+variant). With `--base`, those of another checkout of flowrep run as well. Rates are of the second
 half of a run; the minutes are those of the paper's 2,000,000 frames at that rate.
 """
 
@@ -27,13 +27,21 @@ BUSY = "while True: pass"
 PAPER_FRAMES = 2_000_000  # Table II
 
 
-def train(*overrides: str, root: Path = HERE, **environment: str) -> dict[str, float]:
+def variants(cores: int, *, alone: bool = False) -> list[tuple[str, str, bool]]:
+    """Returns name, override and whether a busy loop runs beside, for each variant."""
+    threads = {"one thread": "threads=1", f"{cores} threads": f"threads={cores}"}
+    each = [(name, override, False) for name, override in threads.items()]
+    busy = [(f"{name}, beside a busy loop", override, True) for name, override, _ in each]
+    return each[:1] if alone else each + busy
+
+
+def train(*overrides: str, root: Path = HERE) -> dict[str, float]:
     """Returns the means of metrics.csv's columns over the second half of a training."""
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "flowrep.train", *WITHOUT_EVALUATIONS, *overrides]
         subprocess.run(
             [*command, f"hydra.run.dir={folder}/run"],
-            env=os.environ | {"PYTHONPATH": str(root)} | environment,
+            env=os.environ | {"PYTHONPATH": str(root)},
             cwd=folder,
             check=True,
             stdout=subprocess.DEVNULL,
@@ -51,32 +59,30 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=12_000)
     parser.add_argument("--rounds", type=int, default=2)
     parser.add_argument("--base", type=Path, help="another checkout, to compare with")
-    parser.add_argument("--alone", action="store_true", help="with all threads and no busy loop")
+    parser.add_argument("--alone", action="store_true", help="one thread and no busy loop")
     parser.add_argument("overrides", nargs="*", default=["preset=laptop"])
     args = parser.parse_args()
     roots = {"": HERE} | ({"base, ": args.base.resolve()} if args.base else {})
     overrides = [*args.overrides, f"total_frames={args.frames}"]
+    cores = os.cpu_count() or 1
     measured: dict[str, list[dict[str, float]]] = {}
-    for _, (name, root) in product(range(args.rounds), roots.items()):
-        measured.setdefault(f"{name}all threads", []).append(train(*overrides, root=root))
-        if args.alone:
-            continue
-        one = train(*overrides, root=root, OMP_NUM_THREADS="1")
-        measured.setdefault(f"{name}one thread", []).append(one)
-        busy = subprocess.Popen([sys.executable, "-c", BUSY])
+    for _, (base, root), (name, threads, is_busy) in product(
+        range(args.rounds), roots.items(), variants(cores, alone=args.alone)
+    ):
+        busy = subprocess.Popen([sys.executable, "-c", BUSY]) if is_busy else None
         try:
-            beside = train(*overrides, root=root)
+            measured.setdefault(base + name, []).append(train(*overrides, threads, root=root))
         finally:
-            busy.kill()
-            busy.wait()
-        measured.setdefault(f"{name}all threads, beside a busy loop", []).append(beside)
-    print(f"{' '.join(overrides)}, {os.cpu_count()} cores, medians of {args.rounds}")
-    print(f"| training | frames/s | min for {PAPER_FRAMES:,} | of all threads | outside updates |")
+            if busy is not None:
+                busy.kill()
+                busy.wait()
+    print(f"{' '.join(overrides)}, {cores} cores, medians of {args.rounds}")
+    print(f"| training | frames/s | min for {PAPER_FRAMES:,} | of one thread | outside updates |")
     print("| --- | --- | --- | --- | --- |")
     rates = {n: statistics.median(r["frames_per_second"] for r in f) for n, f in measured.items()}
     for name, runs in measured.items():
         outside = statistics.median(run["share_outside_updates"] for run in runs)
-        rate, share = rates[name], rates[name] / rates["all threads"]
+        rate, share = rates[name], rates[name] / rates["one thread"]
         minutes = PAPER_FRAMES / rate / 60
         print(f"| {name} | {rate:.0f} | {minutes:.0f} | {share:.0%} | {outside:.0%} |")
 

@@ -2,12 +2,12 @@
 
     python benchmarks/update.py [--device cuda] [--rounds 5] [--threads 2] [--cpu-time]
 
-All variants learn from the same transitions and take turns, as do the machine's matrix products, so
-that a change of load affects all alike. The floor is the update's own count of operations at the
-highest measured rate of products. "Plain" is the same update with a shared encoder written without
-TorchRL. A CPU without instructions for bfloat16 is measured in float32 alone. `--default-malloc`
-keeps glibc's default allocator settings, to show the effect of `keep_freed_memory`. For machines
-under other load, `--cpu-time` runs on one thread and measures CPU time.
+All variants learn from the same transitions and take turns, as do matrix products, so that a change
+of load affects all alike. The floor is the time that the update's operations would take at the
+highest measured rate of the products. "Plain" is the same update with a shared encoder, written
+without TorchRL. A CPU without instructions for bfloat16 is measured in float32 only.
+`--default-malloc` keeps glibc's default allocator settings, to show the effect of
+`keep_freed_memory`. `--cpu-time` runs on one thread and measures CPU time, for a busy machine.
 """
 
 import argparse
@@ -33,7 +33,7 @@ from flowrep.options import DiscreteSACOptions
 MAPS = ("ego", "obj")
 CHANNELS, ACTIONS = 2, 3
 GAMMA, TAU, TARGET_ENTROPY_WEIGHT = 0.99, 0.005, 0.2
-# (pixels a side, batch); "tiny" tries the script
+# (height and width in pixels, batch); "tiny" is for tests of the script
 SIZES = {
     "48 px, batch 128": (48, 128), "48 px, batch 256": (48, 256), "paper": (84, 1024),
     "tiny": (40, 8),
@@ -42,7 +42,7 @@ STOCK = "TorchRL stock, separate fp32"
 
 
 def random_steps(side: int, batch: int, device: torch.device) -> TensorDict:
-    """Returns steps that all terminate, so that each is a complete transition."""
+    """Returns `[batch]` steps that all terminate, so that each is a complete transition."""
 
     def maps() -> dict[str, torch.Tensor]:
         return {name: torch.randn(batch, CHANNELS, side, side, device=device) for name in MAPS}
@@ -56,7 +56,7 @@ def random_steps(side: int, batch: int, device: torch.device) -> TensorDict:
 
 
 def dtypes_of(device: torch.device) -> dict[str, torch.dtype]:
-    """Returns the precisions worth measuring: emulated bfloat16 takes minutes for an update."""
+    """Returns float32, and bfloat16 unless it is emulated, which takes minutes for an update."""
     fast = {"bf16": torch.bfloat16} if has_bf16(device) else {}
     return fast | {"fp32": torch.float32}
 
@@ -112,7 +112,8 @@ class Network(nn.Module):
 def plain_update(steps: TensorDict, dtype: torch.dtype) -> Callable[[], object]:
     """Returns the shared-encoder update in plain PyTorch; both Qs are one head of twice the width.
 
-    Its Qs mix their hidden layers, which costs a little more in the last one.
+    In this head, each Q also reads the other's hidden units, which makes the last layer a little
+    more expensive.
     """
     side, device = steps["ego"].shape[-1], steps.device
     with torch.device(device):
@@ -136,7 +137,7 @@ def plain_update(steps: TensorDict, dtype: torch.dtype) -> Callable[[], object]:
         alpha = log_alpha.detach().exp()
         with torch.autocast(device.type, dtype, enabled=dtype is not torch.float32):
             with torch.no_grad():
-                # y = r + γ Σ π(a|s') (min Q(s', a) - α log π(a|s')), without the sum at an end
+                # y = r + γ Σ π(a|s') (min Q(s', a) - α log π(a|s')); r alone if s' is terminal
                 embedded = target.embed(following)
                 log_policy = actor(embedded).float().log_softmax(-1)
                 q = two(target.head(embedded)).amin(1)
@@ -212,9 +213,9 @@ def interleaved(
 
 
 class NoModules:
-    """Replaces PyTorch's module tracker, which fails on the modules of a LossModule.
+    """Replaces PyTorch's module tracker, which fails on a LossModule, see docs/upstream.md.
 
-    See docs/upstream.md; only the total is needed.
+    Only the total is needed, not the operations of each module.
     """
 
     parents = ("Global",)
@@ -225,7 +226,7 @@ class NoModules:
 
 
 def operations(update: Callable[[], object]) -> int:
-    """Returns the operations of an update, to be counted in its first call: graphs hide them."""
+    """Returns the operations of an update's first call; in later ones, CUDA graphs hide them."""
     counter = FlopCounterMode(display=False)
     counter.mod_tracker = NoModules()
     with counter:
@@ -251,7 +252,7 @@ def main() -> None:
         torch.manual_seed(0)
         steps = random_steps(side, batch, args.device)
         dtypes = dtypes_of(args.device)
-        # On CUDA an update is a graph from the fourth on, unless eager is asked for.
+        # On CUDA, updates replay a graph from the fourth on, unless they are eager.
         kinds = {"": False} | ({", eager": True} if args.device.type == "cuda" else {})
         updates = {
             f"flowrep {encoder} {precision}{kind}": flowrep_update(

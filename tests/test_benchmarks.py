@@ -5,6 +5,7 @@ import pytest
 
 from flowrep.envs.sensing import Sensing
 from flowrep.simulator.camera import depth_from_zbuffer
+from tests.config.composing import composed
 from tests.running import ROOT, run_python
 
 
@@ -28,6 +29,12 @@ def test_pybullets_picture_is_timed_with_everyone_in_place(monkeypatch):
         assert people.any()
         # Without them the road or the houses behind would be seen, many metres away.
         np.testing.assert_allclose(depth[people], maps["depth"][0][people], rtol=0.02)
+
+
+def test_the_variants_of_a_training_differ_in_the_threads_of_its_updates():
+    from benchmarks.training import variants
+
+    assert [composed(threads).threads for _, threads, _ in variants(4)] == [1, 4, 1, 4]
 
 
 @pytest.mark.slow
