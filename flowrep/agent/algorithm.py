@@ -251,8 +251,8 @@ class Algorithm(ABC):
             weight.copy_(saved[name])
         self.optimizer.state.clear()  # a state without updates has no moments
         for name, moments in state["moments"].items():
-            own = {key: value.to(self.device, copy=True) for key, value in moments.items()}
-            self.optimizer.state[self.trained[name]] = own
+            copied = {key: value.to(self.device, copy=True) for key, value in moments.items()}
+            self.optimizer.state[self.trained[name]] = copied
         self.updates = state["updates"]
         self.divergence.reset(self.updates)
         self._capture()  # Adam's moments are at new addresses

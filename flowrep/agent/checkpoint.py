@@ -90,8 +90,8 @@ def load_checkpoint(
     if not path.is_file():
         raise CheckpointError(f"no checkpoint at {path}: name a run folder that has saved one")
     try:
-        # safetensors opens the name twice; that of an open file stays the same file if a run that
-        # goes on replaces the checkpoint in between
+        # safetensors opens the name twice. /dev/fd/N stays the same file, even if a running
+        # training replaces the checkpoint in between.
         with (
             path.open("rb") as opened,
             safe_open(f"/dev/fd/{opened.fileno()}", framework="pt") as file,
@@ -120,25 +120,28 @@ def load_checkpoint(
         ) from error
 
 
-def _as_json(value: Any, place: str, tensors: dict[str, Tensor]) -> Any:
-    """Returns `value` as JSON data and adds its tensors to `tensors`, under unique names."""
+def _as_json(value: Any, at: str, tensors: dict[str, Tensor]) -> Any:
+    """Returns `value` as JSON data and adds its tensors to `tensors`, under unique names.
+
+    `at` is where the value is in the state, such as `/agent/weights`.
+    """
     if isinstance(value, Tensor):
         tensor = value.detach().cpu().contiguous()
         memory = tensor.untyped_storage().data_ptr()
         if any(memory == other.untyped_storage().data_ptr() for other in tensors.values()):
             tensor = tensor.clone()  # the format allows no shared memory
-        name = f"{place} {len(tensors)}"
+        name = f"{at} {len(tensors)}"
         tensors[name] = tensor
         return {"tensor": name}
     if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
-        return {"dict": {k: _as_json(v, f"{place}/{k}", tensors) for k, v in value.items()}}
+        return {"dict": {k: _as_json(v, f"{at}/{k}", tensors) for k, v in value.items()}}
     if isinstance(value, list | tuple):
-        return [_as_json(v, f"{place}/{i}", tensors) for i, v in enumerate(value)]
+        return [_as_json(v, f"{at}/{i}", tensors) for i, v in enumerate(value)]
     if value is None or isinstance(value, str | bool | int | float):
         return value
     raise TypeError(
-        f"checkpoint[{place!r}] is a {type(value).__name__}: expected a tensor, dict with strings "
-        "as keys, list, str, int, float, bool or None"
+        f"checkpoint[{at!r}] is a {type(value).__name__}: expected a tensor, dict with strings as "
+        "keys, list, str, int, float, bool or None"
     )
 
 

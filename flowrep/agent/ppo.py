@@ -123,7 +123,7 @@ class PPO(Algorithm):
         L_V = value_weight · mean (V(s) - R)²
         L_H = entropy_weight · mean Σ_a π(a|s) log π(a|s)
 
-    The arguments are those of `OffPolicy`.
+    The arguments are those of `OffPolicy`, without `mirror_image`.
     """
 
     OPTIONS = PPOOptions

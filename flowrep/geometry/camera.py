@@ -8,7 +8,14 @@ from typing import Literal, TypeAlias
 import torch
 from torch import Tensor
 
-from flowrep.geometry.checks import check_name, check_shape, common_batch, first_wrong, over_points
+from flowrep.geometry.checks import (
+    check_name,
+    check_shape,
+    checked_count,
+    common_batch,
+    first_wrong,
+    over_points,
+)
 
 FovAxis: TypeAlias = Literal["horizontal", "vertical"]
 
@@ -107,7 +114,8 @@ def intrinsics_from_fov(
     Args:
         fov_deg: the field of view, degrees, between 0 and 180.
         axis: `"horizontal"` or `"vertical"`.
-        height: of the picture, pixels; as `width`.
+        height: of the picture, pixels.
+        width: of the picture, pixels.
         pixel_aspect: a pixel's width over its height, fy / fx; 1 for square pixels.
         dtype: of K.
 
@@ -119,8 +127,8 @@ def intrinsics_from_fov(
     check_name("axis", axis, FovAxis)
     if not 0 < fov_deg < 180:
         raise ValueError(f"fov_deg must lie between 0 and 180 degrees, got {fov_deg}")
-    if height < 1 or width < 1:
-        raise ValueError(f"height and width must be at least 1 pixel, got {height} and {width}")
+    for name, side in {"height": height, "width": width}.items():
+        checked_count(name, side)
     if not 0 < pixel_aspect < math.inf:
         raise ValueError(f"pixel_aspect must be positive, got {pixel_aspect}")
     focal = (width if axis == "horizontal" else height) / 2 / math.tan(math.radians(fov_deg) / 2)
@@ -156,7 +164,8 @@ def check_intrinsics(
     The bounds for a size are wide: a focal length of 0.2 to 20 times the longer side, that is,
     fields of view of 136 to 3 degrees, and a principal point at least a tenth of the picture inside
     its border. Real lenses are centred to a few per cent, and a crop may cut off four ninths of the
-    picture on one side. The K of a picture of twice the size has its principal point at the border.
+    picture on one side. The K of a picture of twice the size is refused, since its principal point
+    is at the border.
 
     The check waits for a GPU.
 

@@ -47,9 +47,9 @@ def adapt_depth(
         scale_m: metres per unit of `depth`, 1 if it is float; whole numbers, such as uint16
             millimetres (0.001), need it. Not for the two buffers.
         nothing: a value, before scaling, that means missing depth; it becomes nan.
-        sky: a value, before scaling, that means no surface; it becomes inf. A positive value is a
-            far plane, and depth beyond 0.999 of it becomes inf, too. Otherwise, depth below the
-            value becomes inf, too. Not for the two buffers.
+        sky: a value, before scaling, that means no surface. A positive value is a far plane: depth
+            from 0.999 of it on becomes inf. Otherwise, depth up to the value becomes inf. Not for
+            the two buffers.
 
     Raises:
         ValueError: an argument that `kind` needs is missing, or one that it doesn't read is given.

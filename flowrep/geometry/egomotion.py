@@ -35,7 +35,7 @@ from torch.nn import functional
 from flowrep.geometry.checks import check_shape, common_batch
 from flowrep.geometry.closed_form import LARGEST, MIN_DEPTH_RATIO, SMALLEST, known_camera
 
-VOTERS = 1 << 15  # pixels in the final choice; a share among so many is right within 1 %
+VOTERS = 1 << 15  # pixels in the final choice; a share of so many is accurate to 1 %
 PIXELS = 1536  # pixels in a Gauss-Newton step; more don't improve the motion
 SCORED_PIXELS = 320  # pixels that score a hypothesis
 # Four pixels are eight equations for six unknowns. If half of the pixels are on moving bodies, one
@@ -58,7 +58,7 @@ _RIVAL_STEPS = 3  # Gauss-Newton steps of the second candidate
 _INLIER_SCALES = 2.5  # in standard deviations; 96 % of normal errors in two channels are within
 _STILL_PX = 0.2  # flow with residuals up to this standard deviation may be that of a still camera
 _LEAST_STRENGTH = 0.1  # least mean square of a motion's flow, relative to that of the residuals
-_CHANCES = 16  # least multiple of the strength 3 / N that a motion fitted to noise has by chance
+_CHANCES = 16  # a motion must be this many times as strong as one fitted to noise, 3 / N
 _LEAST_SCALE_PX = 2e-3  # far above the rounding of exact float32 flow, far below any measured flow
 _SCALES = 1.5  # standard deviations at which the weight of a pixel is a quarter
 _QUANTILE = 1 / 3  # of residuals, which gives their scale; half of the pixels may be outliers
@@ -258,9 +258,10 @@ def _voters(
     structure: Tensor | None,
     known_frame: Tensor,
 ) -> _Samples:
-    """Returns up to `VOTERS` pixels of each frame in random order; none of a bad frame is known.
+    """Returns up to `VOTERS` pixels of each frame in random order.
 
-    The part of their flow that a change of K causes is removed.
+    The part of their flow that a change of K causes is removed. Where `known_frame` `[B]` is False,
+    no pixel is known.
     """
     shuffled = _shuffled.__wrapped__ if torch.compiler.is_compiling() else _shuffled
     pixel, centres = shuffled(*flow.shape[-2:], flow.device)

@@ -93,14 +93,14 @@ def check_path(layout: Layout, path: Path) -> None:
     if not layout.drivable.covers(footprint):
         raise SceneError(f"{key}: starts off the road; move or widen its start zone")
     if shapely.intersects(footprint, blocks).any():
-        raise SceneError(f"{key}: its start collides; move the start or what is in it")
+        raise SceneError(f"{key}: its start is blocked by a box; move one of them")
     if shapely.intersects(end, blocks).any():
-        raise SceneError(f"{key}: its end zone is built over; move what is in it")
+        raise SceneError(f"{key}: its end zone is blocked by a box; move one of them")
     start, vehicle = shapely.Point(layout.start_state(path.start)[:2]), layout.scene.vehicle
     if end.intersects(start):
         raise SceneError(f"{key}: starts inside its end zone {path.end!r}; move one of them")
-    # One connected piece of ground, wide enough for the vehicle's narrower side, must hold both
-    # the start and the end.
+    # Start and end must lie in one connected piece of the ground that is at least half of the
+    # vehicle's narrower side away from everything else.
     room = free_ground(layout, path).buffer(-min(vehicle.width_m, vehicle.length_m) / 2)
     if not any(part.covers(start) and part.intersects(end) for part in shapely.get_parts(room)):
         raise SceneError(

@@ -81,7 +81,7 @@ NotNegative = Annotated[float, Strict(), Field(ge=0.0)]
 Angle = Annotated[float, Strict(), Field(ge=-360.0, le=360.0)]
 HouseSide = Annotated[float, Strict(), Field(ge=1.0)]  # rows are filled house by house
 Count = Annotated[int, Strict(), Field(ge=1)]
-Pixels = Annotated[int, Strict(), Field(ge=1, le=4096)]  # 4K; more ends in a MemoryError
+Pixels = Annotated[int, Strict(), Field(ge=1, le=4096)]  # 4K; more would exhaust memory
 Whole = Annotated[int, Strict(), Field(ge=0)]
 Name = Annotated[str, StringConstraints(min_length=1)]
 FileName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
@@ -245,7 +245,7 @@ class PedestrianGroup(Part):
 
     def __post_init__(self) -> None:
         if self.standing > self.count:
-            raise ValueError("give a standing of at most count")
+            raise ValueError("standing is more than count; give a smaller number")
 
 
 @dataclass(frozen=True)

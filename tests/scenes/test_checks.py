@@ -88,10 +88,10 @@ def refusal(data, changes):
         ({"categories": ALL, "crosswalks": [CROSSWALK | {"at_m": 50.0}]}, "crosswalks[0]"),
         # Paths that are blocked.
         ({"vehicle.width_m": 9.0}, "paths.left: starts off the road"),
-        ({"obstacles.0.center_m": [3.0, 0.0]}, "paths.left: its start collides"),
+        ({"obstacles.0.center_m": [3.0, 0.0]}, "paths.left: its start is blocked"),
         (
             {"closures.1.at_m": 65.0, "paths.1.closures": ["right_arm"]},
-            "paths.right: its end zone is built over",
+            "paths.right: its end zone is blocked",
         ),
         ({"paths.0.closures": ["left_arm"]}, "paths.left: no free road leads from 'south' to 'w"),
         ({"paths.0.end": "south"}, "paths.left: starts inside"),
