@@ -74,19 +74,19 @@ def candidates_of(config: EvaluateConfig) -> list[Candidate]:
     for path in config.run or []:
         for run in RunFolder.all_in(path):
             runs.setdefault(run.path.resolve(), run)
-    for name in config.own_policies:
+    for name in config.other_policies:
         check_policy(name)
 
     from flowrep.experiment.agents import Agent
 
     machine = config.model_dump(include={"device", "num_envs", "num_workers"})
-    if not config.own_policies:
+    if not config.other_policies:
         load = partial(Agent.load, scene=config.scene, trusted=config.trusted, **machine)
         return [Candidate(run, partial(load, run.path), config.policy) for run in runs.values()]
     keys = ("scene", "representations", "flow", "motion", "noise")
     maps = {key: getattr(config, key) for key in keys}
     candidates = []
-    for name in config.own_policies:
+    for name in config.other_policies:
         folder = Path(config.output or f"outputs/evaluate/{folder_name(name)}")
         if (folder / "config.yaml").exists():
             raise UsageError(f"output={folder} is a run's folder; give another")
@@ -108,7 +108,7 @@ def evaluate_one(
 
     agent, folder = candidate.load(), candidate.folder
     folder.read_episodes()  # a damaged table is refused before hours of episodes, not after
-    if not config.own_policies:  # whose networks may be large
+    if not config.other_policies:  # whose networks may be large
         build.share_cores(agent.config)
     origin = agent.origin("evaluate")
     # agents of one scene share the baselines' episodes

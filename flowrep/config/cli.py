@@ -156,8 +156,10 @@ def checked(config: DictConfig, schema: type[Command]) -> Any:
 
 def plain_config(config: DictConfig) -> dict[str, Any]:
     """Returns a composed config as plain data, without Hydra's, with interpolations resolved."""
-    own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
-    plain: Any = OmegaConf.to_container(own, resolve=True, throw_on_missing=True)
+    keys = [str(key) for key in config if key != "hydra"]
+    plain: Any = OmegaConf.to_container(
+        OmegaConf.masked_copy(config, keys), resolve=True, throw_on_missing=True
+    )
     return plain
 
 

@@ -257,27 +257,27 @@ class EvaluateConfig(Command):
     video: CountOrZero
 
     @property
-    def own_policies(self) -> list[str]:
-        """The policies that are not a run's: scripts, modules, programs and trained agents."""
+    def other_policies(self) -> list[str]:
+        """The policies that are not of `run`: scripts, modules, programs and saved agents."""
         return [name for name in self.policy if name not in get_args(Acting)]
 
     @model_validator(mode="after")
     def _fits_together(self) -> EvaluateConfig:
-        own = self.own_policies
-        for name in own:
+        others = self.other_policies
+        for name in others:
             is_file = name.endswith((".pt2", ".safetensors"))
             if ":" not in name and not is_file and name != "pretrained":
                 raise ValueError(
                     f"policy={name}: should be greedy, sampled, pretrained, path.py:make, "
                     "package.module:make, path.pt2 or path.safetensors"
                 )
-        if own and len(own) < len(self.policy):
+        if others and len(others) < len(self.policy):
             raise ValueError("policy: greedy and sampled are of runs; evaluate others separately")
-        if own and self.run is not None:
-            raise ValueError(f"run= and policy={own[0]} can't be combined: give one of them")
-        if not own and self.run is None:
+        if others and self.run is not None:
+            raise ValueError(f"run= and policy={others[0]} can't be combined: give one of them")
+        if not others and self.run is None:
             raise ValueError("run needs a value: run=<a run's or a sweep's folder>")
-        for name in own:
+        for name in others:
             is_trained = name == "pretrained" or name.endswith(".safetensors")
             for key in ("scene",) if is_trained else ("scene", "representations"):
                 if getattr(self, key) is None:
@@ -286,7 +286,7 @@ class EvaluateConfig(Command):
         for key in ("representations", "flow", "motion", "noise", "output"):
             if key == "representations" and all(options.keys() == {"_target_"} for options in maps):
                 continue
-            if not own and getattr(self, key) is not None:
+            if not others and getattr(self, key) is not None:
                 raise ValueError(f"{key}= is for a policy of your own; a run has its own {key}")
         return self
 
@@ -463,7 +463,7 @@ def _line(details: Any) -> str:
     if kind == "missing":
         return f"{key} needs a value: {key}=..."
     if kind == "value_error":
-        names_itself = key == "" or message.startswith(f"{key} ")  # as a scene's own
+        names_itself = key == "" or message.startswith(f"{key} ")  # as those of a scene do
         return message if names_itself else f"{key}: {message}"
     remedy = ""
     if kind == "list_type":

@@ -125,7 +125,9 @@ def make_env(
         raise ValueError(f"num_envs is {num_envs}; give at least one env")
     device = usable_device(device)
     loaded = load_scene(scene)
-    # The estimator determines the scale of the pictures, whatever `picture_scale` is.
+    # An estimator and its pictures need one scale; that of a mapping counts.
+    if flow == "estimated":
+        flow = {"source": flow, "picture_scale": picture_scale}
     if isinstance(flow, Mapping):
         picture_scale = flow.get("picture_scale", picture_scale)
     drawn: Any = {"renderer": choose_renderer(renderer), "picture_scale": picture_scale}

@@ -77,7 +77,7 @@ class Agent(Driver):
             UsageError: a key or a value is wrong; the message names it.
         """
         if "resume" in overrides:
-            raise UsageError("continue a run with python -m flowrep.train resume=<its folder>")
+            raise UsageError("resume=: continue a run with python -m flowrep.train resume=<folder>")
         config, default, typed = composed("train", overrides, TrainConfig)
         run = RunFolder(default if folder is None else folder)
         with run.held("training"), StopRequest() as stop:
@@ -146,6 +146,8 @@ class Agent(Driver):
                 if value is not None:
                     raise UsageError(f"{key}= is for a policy of your own, not for policy={name}")
         if name in BASELINES or is_external:
+            if precision is not None:
+                raise UsageError(f"precision= is for a trained agent, not for policy={name}")
             if is_external and not maps:
                 raise UsageError(f"representations needs a value for policy={name}")
             asked: dict[str, Any] = {
@@ -211,6 +213,8 @@ class Agent(Driver):
             "baselines": baselines,
         }
         checked = dict(validated(Episodes, asked))
+        if checked["policies"] != ["greedy"] and not hasattr(self.policy, "get_dist"):
+            raise UsageError("policies: only a trained agent can draw its actions")
         if isinstance(self.policy, str):
             checked["policies"] = [self.policy]
         evaluation = PairedEvaluation(**checked)
@@ -223,7 +227,7 @@ class Agent(Driver):
         With `small`, each weight takes one byte, see `packed`.
         """
         if not isinstance(self.config, TrainConfig) or isinstance(self.policy, str):
-            raise UsageError("only an agent that flowrep trained can be saved")
+            raise UsageError("only an agent that flowrep trained has weights to save")
         if Path(path).suffix != ".safetensors":
             raise UsageError(f"save to a file whose name ends in .safetensors, not to '{path}'")
         weights = dict(self.policy.state_dict())  # type: ignore[attr-defined]

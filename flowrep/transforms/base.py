@@ -153,7 +153,7 @@ class MapTransform(Transform):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        # TorchRL's own `_reset` doesn't call the transform.
+        # TorchRL's `_reset` doesn't call the transform.
         begins = tensordict.get("_reset", None)
         # Selecting rows by a mask waits for a GPU, and each new number of rows would recompile.
         if begins is None or begins.is_cuda or self.compiled:

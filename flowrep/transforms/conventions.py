@@ -96,9 +96,9 @@ _ISAAC_3 = Convention(
     flow_options={"direction": "backward", "grid": "current"},
     K="intrinsic_matrices, pixel centres at halves",
     notes="Quaternions are (x, y, z, w). Buffers are ProxyArrays: pass their `.torch`. The "
-    "camera's pose is that of its start unless its config has update_latest_camera_pose=True. "
-    "Motion vectors come from the RTX renderers alone, Newton's Warp renderer has none. Ids differ "
-    "between environments: bodies' motions need an env of one.",
+    "camera's pose stays that of the start unless its config has update_latest_camera_pose=True. "
+    "Only the RTX renderers give motion vectors, Newton's Warp renderer doesn't. Ids differ "
+    "between environments, so bodies' motions need a batch of one environment.",
 )
 
 CONVENTIONS: dict[str, Convention] = {
@@ -113,8 +113,8 @@ CONVENTIONS: dict[str, Convention] = {
         ),
         pose_options={"layout": "xyz_wxyz", "axes": "opencv"},
         bodies_options={"layout": "xyz_wxyz"},
-        notes="Quaternions are (w, x, y, z). A TiledCamera's pose is that of its start unless its "
-        "config has update_latest_camera_pose=True (return_latest_camera_pose before 2.1).",
+        notes="Quaternions are (w, x, y, z). A TiledCamera's pose stays that of the start unless "
+        "its config has update_latest_camera_pose=True (return_latest_camera_pose before 2.1).",
     ),
     "maniskill": Convention(
         simulator="ManiSkill 3.0.1",
@@ -144,10 +144,10 @@ CONVENTIONS: dict[str, Convention] = {
         ids="segmentation",
         background=(),
         K="intrinsics_from_fov(fovy), with <quality offsamples='0'/>",
-        notes="Ids are geoms', so body_ids names geoms, and xpos and xquat have a row for each: "
-        "data.xpos[model.geom_bodyid[geoms]]. Where nothing is drawn, depth is the far plane, "
-        "model.vis.map.zfar * model.stat.extent. The camera's pose is cam_xmat with cam_xpos. Call "
-        "mj_forward before reading poses.",
+        notes="Ids are those of geoms: body_ids lists geoms, and xpos and xquat need a row for "
+        "each, data.xpos[model.geom_bodyid[geoms]]. Where nothing is drawn, depth is the far "
+        "plane, model.vis.map.zfar * model.stat.extent. The camera's pose is cam_xmat with "
+        "cam_xpos. Call mj_forward before reading poses.",
     ),
     "mjlab": Convention(
         simulator="mjlab 1.6 (MuJoCo Warp 4.0)",
@@ -162,9 +162,9 @@ CONVENTIONS: dict[str, Convention] = {
         ids="segmentation",
         background=(),
         K="intrinsics_from_fov(fovy)",
-        notes="As MuJoCo's, but depth is 0 where nothing is hit. A camera with sensorsize has K "
-        "from its focal lengths and sensor, cropped to the picture's aspect ratio. "
-        "TorchRL's MJLabWrapper passes on RGB alone; a group of observations brings the rest.",
+        notes="As MuJoCo, but depth is 0 where nothing is hit. If a camera has sensorsize, its K "
+        "follows from focal lengths and sensor, cropped to the picture's aspect ratio. "
+        "TorchRL's MJLabWrapper passes on only RGB; the rest needs a group of observations.",
     ),
     "newton": Convention(
         simulator="Newton 1.8",
@@ -181,10 +181,10 @@ CONVENTIONS: dict[str, Convention] = {
         ids="shape_index",
         background=(0xFFFFFFFF,),
         K="intrinsics_from_fov(camera_fov), pixel centres at halves",
-        notes="Ids are those of shapes, so body_ids names shapes and body_q has a row for each: "
-        "state.body_q[model.shape_body[shapes]]. Shapes are counted through all worlds. A miss has "
-        "depth 0, clear_data.clear_depth; "
-        "SensorTiledCamera documents a negative one.",
+        notes="Ids are those of shapes: body_ids lists shapes, and body_q needs a row for each, "
+        "state.body_q[model.shape_body[shapes]]. Shapes are numbered across all worlds. Where "
+        "nothing is hit, depth is 0, clear_data.clear_depth; SensorTiledCamera documents a "
+        "negative value.",
     ),
     "genesis": Convention(
         simulator="Genesis 1.4.5",
@@ -198,8 +198,8 @@ CONVENTIONS: dict[str, Convention] = {
         ids="segmentation",
         K="camera.intrinsics",
         notes="far_m is the camera's far. Ids are indices of scene.segmentation_idx_dict, at "
-        "VisOptions(segmentation_level='link') one a link. Where a driver multisamples "
-        "depth, it mixes at edges. TorchRL's GenesisWrapper doesn't reset the scene.",
+        "VisOptions(segmentation_level='link') one per link. If a driver multisamples depth, it "
+        "is a mixture at edges. TorchRL's GenesisWrapper doesn't reset the scene.",
     ),
     "habitat": Convention(
         simulator="Habitat-Sim 0.3.3",
@@ -277,9 +277,9 @@ CONVENTIONS: dict[str, Convention] = {
         bodies_options={"layout": "xyz_wxyz"},
         ids="segmentation",
         K="intrinsics_from_fov(fov, axis='horizontal')",
-        notes="far_m is what the sky has in your world, such as 65504: look at a pixel. Ids are "
-        "colours: pack them, R + 256 G + 65536 B, by simGetSegmentationColorMap. OpticalFlow is of "
-        "the camera's motion alone, without a documented unit.",
+        notes="far_m is the depth of a pixel of the sky in your world, such as 65504. Ids are "
+        "colours: pack them, R + 256 G + 65536 B, by simGetSegmentationColorMap. OpticalFlow is "
+        "only that of the camera's motion, and its unit isn't documented.",
     ),
     "pybullet": Convention(
         simulator="PyBullet 3.2.7",
@@ -296,7 +296,7 @@ CONVENTIONS: dict[str, Convention] = {
         notes="flowrep.pybullet.BulletCamera does all this, links and bodies that come and go "
         "included. The view is np.reshape(viewMatrix, (4, 4)).T. Ids of links are "
         "body + ((link + 1) << 24), and a link's pose is getLinkState's with "
-        "computeForwardKinematics=1: without it, a substep old.",
+        "computeForwardKinematics=1; without that, it is a substep old.",
     ),
 }
 

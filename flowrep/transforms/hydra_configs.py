@@ -1,6 +1,6 @@
-"""Hydra configs of the transforms, in TorchRL's own config group `transform`.
+"""Hydra configs of the transforms, in TorchRL's config group `transform`.
 
-Importing this module registers them, beside those of `torchrl.trainers.algorithms.configs`:
+Importing this module registers them and those of `torchrl.trainers.algorithms.configs`:
 
 ```yaml
 defaults:

@@ -273,7 +273,7 @@ def uniform(bits: Tensor) -> Tensor:
 
 
 def _shifted(z: Tensor, bits: int) -> Tensor:
-    """Returns z shifted right and filled with zeros; torch's own shift repeats the sign."""
+    """Returns z shifted right and filled with zeros; torch's shift repeats the sign."""
     moved = z >> bits
     moved &= (1 << (64 - bits)) - 1
     return moved

@@ -136,6 +136,7 @@ def test_the_folder_of_another_run_is_refused(trained):
         ({"fps": [0]}, "fps"),
         ({"seed": -1}, "seed"),
         ({"policies": ["best"]}, "policies"),
+        ({"policies": ["sampled"]}, "policies"),  # it has no probabilities to draw from
         ({"baselines": ["plan"]}, "baselines"),
     ],
 )
@@ -150,6 +151,7 @@ def test_an_evaluation_that_can_not_be_is_refused(given, named):
     [
         # what a baseline or an agent of flowrep's would ignore
         ("planner", {"flow": {"source": "exact"}}, "flow="),
+        ("planner", {"precision": "fp32"}, "precision="),
         ("pretrained", {"scene": "s_turn", "motion": "exact"}, "motion="),
         ("pretrained", {"scene": "s_turn", "representations": ["ego"]}, "representations="),
         ("planner", {"representations": {"rgb": None}}, "representations="),
