@@ -107,8 +107,8 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tu
     """Returns Wilson's score interval of a proportion; (0, 1) without trials."""
     if not trials:
         return 0.0, 1.0
-    # The interval holds the proportions p from which the observed share is at most z standard
-    # errors away. Its ends are the solutions of (share - p)² = z² p (1 - p) / trials.
+    # the proportions p from which the observed share is at most z standard errors away: the
+    # solutions of (share - p)² = z² p (1 - p) / trials
     z2 = NormalDist().inv_cdf(0.5 + confidence / 2) ** 2
     share = successes / trials
     centre = (share + z2 / (2 * trials)) / (1 + z2 / trials)
@@ -181,7 +181,7 @@ def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     for name in rows[0]:
         heading = name.replace("_", " ").replace(": ", ":\n")
         is_number = all(str(row[name])[:1] in "-0123456789" for row in rows)
-        # A policy's name may be a long path, which is wrapped; numbers are not.
+        # a policy's name may be a long path: it is folded, numbers are not
         table.add_column(
             heading,
             no_wrap=name != "policy",
@@ -190,6 +190,6 @@ def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
         )
     for row in rows:
         table.add_row(*map(str, row.values()))
-    # Names are plain text: a[b] is no markup, :car: no emoji.
+    # names are text: a[b] is no markup, :car: no emoji
     console = Console(width=max(100, Console().width), markup=False, emoji=False)
     console.print(table)
