@@ -172,6 +172,14 @@ class EnvConfig(Command):
     noise: Noise
     scene: Scene
 
+    @model_validator(mode="after")
+    def _can_be_rendered(self) -> EnvConfig:
+        if self.renderer == "pybullet" and getattr(self.flow, "picture_scale", 1) > 1:
+            raise ValueError(
+                "renderer=pybullet draws pictures only in the maps' size: add flow.picture_scale=1"
+            )
+        return self
+
 
 Acting = Literal["greedy", "sampled"]
 """How an agent acts in its final evaluation."""

@@ -247,7 +247,7 @@ class EstimatedFlow(FlowTransform):
         preset: of DIS, see `flowrep.transforms.DIS`; RAFT doesn't read it.
         min_side_px: see `flowrep.transforms.DIS`; RAFT uses at least 128.
         intrinsics: K `[3, 3]` of the maps, or its key; see `RawFlow`, as for `prev_intrinsics`.
-            None doesn't compensate the camera's motion.
+            If None, the camera's motion is not compensated.
         picture_scale: k, the pictures' size over the maps'.
         outputs: which of `"raw"` and `"unscaled"` to write.
         scale: factor on raw; for `out_keys` see `RawFlow`.

@@ -61,6 +61,7 @@ def refusal(command, model, line):
         "flow.estimator=abc flow=estimated",
         "flow.estimator=raft_small flow=estimated",  # without weights
         "flow.weights=raft.pth flow=estimated",  # which dis doesn't have
+        "renderer=pybullet flow=estimated",  # whose picture_scale is 4
         # keys
         "~seed",
         "+algorithm.gama=0.9",
@@ -84,6 +85,7 @@ def test_a_value_that_can_not_be_is_named(line):
         "total_frames=5000 algorithm.learning_starts=4990",
         "algorithm.batch_size=32",
         "algorithm=ppo total_frames=2048",
+        "renderer=pybullet flow=estimated flow.picture_scale=1",
         "seed=2147483647 algorithm.gamma=1 algorithm.tau=1 evaluation.baselines=[]",
         "resume=there total_frames=512",  # the run's own algorithm decides whether that is enough
         "algorithm._target_=my.Own +algorithm.mine=3",
