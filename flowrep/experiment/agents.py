@@ -150,20 +150,8 @@ class Agent(Driver):
                 raise UsageError(f"precision= is for a trained agent, not for policy={name}")
             if is_external and not maps:
                 raise UsageError(f"representations needs a value for policy={name}")
-            asked: dict[str, Any] = {
-                "scene": given_scene or load_scene("straight_road"),
-                # Replaced below: the schema would refuse maps whose options have defaults.
-                "representations": {"rgb": {}},
-                "flow": flow or ExactFlow(),
-                "motion": motion or "exact",
-                "noise": noise or Noise(),
-                "speed": "normal",
-                "renderer": "auto",
-                "seed": 0,
-                "num_envs": 1,
-            }
-            config = validated(EnvConfig, asked | machine)
-            config = config.model_copy(update={"representations": maps if is_external else {}})
+            values = {"flow": flow, "motion": motion, "noise": noise} | machine
+            config = _config_without_run(given_scene, maps if is_external else {}, values)
             return cls(_external(name, config) if is_external else name, config)
         trained, frames, weights = _stored(name, given_scene, trusted)
         section = trained.algorithm
@@ -204,7 +192,7 @@ class Agent(Driver):
             policies: "greedy" takes the likeliest action, "sampled" draws one.
             baselines: such as "planner", "never_turn" and "random", on the same episodes.
         """
-        asked = {
+        values = {
             "episodes": episodes,
             "speeds": speeds or [self.config.speed],
             "fps": fps or [self.config.scene.frame_rate_hz],
@@ -212,7 +200,7 @@ class Agent(Driver):
             "policies": policies,
             "baselines": baselines,
         }
-        checked = dict(validated(Episodes, asked))
+        checked = dict(validated(Episodes, values))
         if checked["policies"] != ["greedy"] and not hasattr(self.policy, "get_dist"):
             raise UsageError("policies: only a trained agent can draw its actions")
         if isinstance(self.policy, str):
@@ -233,6 +221,27 @@ class Agent(Driver):
         weights = dict(self.policy.state_dict())  # type: ignore[attr-defined]
         state = {"frames": self.frames, "config": self.config.plain()}
         save_checkpoint(path, state | {"policy": packed(weights) if small else weights})
+
+
+def _config_without_run(
+    scene: Scene | None, maps: Mapping[str, Any], values: Mapping[str, Any]
+) -> EnvConfig:
+    """Returns the config of the env of a baseline or of a policy from another project."""
+    defaults: dict[str, Any] = {
+        "scene": scene or load_scene("straight_road"),
+        # Replaced below: the schema would refuse maps whose options have defaults.
+        "representations": {"rgb": {}},
+        "flow": ExactFlow(),
+        "motion": "exact",
+        "noise": Noise(),
+        "speed": "normal",
+        "renderer": "auto",
+        "seed": 0,
+        "num_envs": 1,
+    }
+    given = {key: value for key, value in values.items() if value is not None}
+    config = validated(EnvConfig, defaults | given)
+    return config.model_copy(update={"representations": maps})
 
 
 def _stored(
