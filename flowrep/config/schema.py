@@ -239,6 +239,13 @@ class TrainConfig(EnvConfig):
                     f"algorithm.{key}={value}: the first update would come after {frames} frames, "
                     f"and total_frames is {self.total_frames}: raise it, or lower algorithm.{key}"
                 )
+        least = 2 * self.num_envs  # a step of all envs, and the one before
+        capacity = getattr(self.algorithm, "replay_capacity", least)
+        if capacity < least:
+            raise ValueError(
+                f"algorithm.replay_capacity={capacity} can't hold two steps of "
+                f"num_envs={self.num_envs}: give at least {least}, or fewer envs"
+            )
         return self
 
 

@@ -91,11 +91,17 @@ def is_finished(folder: Path, config: TrainConfig) -> bool:
 
 
 def success_of(folder: Path) -> float:
-    """Returns the greedy policy's success in a run's last final evaluation, or nan."""
-    greedy = [row for row in _final(folder) if row["policy"] == "greedy"]
-    last = max((int(row["frames"]) for row in greedy), default=0)
-    ends = [row["outcome"] for row in greedy if int(row["frames"]) == last]
-    return ends.count("success") / len(ends) if ends else float("nan")
+    """Returns the agent's success in a run's last final evaluation; nan without one.
+
+    It is that of greedy actions, or of sampled ones if these alone were evaluated.
+    """
+    rows = _final(folder)
+    for policy in ("greedy", "sampled"):
+        acted = [row for row in rows if row["policy"] == policy]
+        last = max((int(row["frames"]) for row in acted), default=0)
+        if ends := [row["outcome"] for row in acted if int(row["frames"]) == last]:
+            return ends.count("success") / len(ends)
+    return float("nan")
 
 
 def _final(folder: Path) -> list[dict[str, str]]:

@@ -71,6 +71,7 @@ def refusal(command, model, line):
         "algorithm.learning_starts=4991 total_frames=5000",
         "algorithm.batch_size=31",
         "algorithm.rollout_length=64 algorithm=ppo total_frames=2047",
+        "algorithm.replay_capacity=63 num_envs=32",
         "algorithm.batch_size=2049 algorithm=ppo",
     ],
 )
@@ -85,6 +86,7 @@ def test_a_value_that_can_not_be_is_named(line):
         "total_frames=5000 algorithm.learning_starts=4990",
         "algorithm.batch_size=32",
         "algorithm=ppo total_frames=2048",
+        "algorithm.replay_capacity=64 num_envs=32",
         "renderer=pybullet flow=estimated flow.picture_scale=1",
         "seed=2147483647 algorithm.gamma=1 algorithm.tau=1 evaluation.baselines=[]",
         "resume=there total_frames=512",  # the run's own algorithm decides whether that is enough

@@ -1,5 +1,7 @@
 """How episodes ended, in numbers: shares with intervals, causes of failure, tables."""
 
+import math
+
 import pytest
 
 from flowrep.experiment.outcomes import (
@@ -8,6 +10,7 @@ from flowrep.experiment.outcomes import (
     failure_causes,
     outcome_shares,
     print_results,
+    success_of,
     wilson_interval,
 )
 from flowrep.experiment.run import RunFolder
@@ -47,6 +50,23 @@ def test_an_interval_contains_its_share_and_stays_a_probability():
 def test_shares_are_of_all_episodes():
     shares = outcome_shares(["success", "success", "timeout", "collision"])
     assert [round(share, 2) for share, _, _ in shares.values()] == [0.5, 0.25, 0.0, 0.25]
+
+
+def test_a_runs_success_is_that_of_greedy_actions_or_of_sampled_ones_alone(tmp_path):
+    """Baselines and earlier evaluations of a run that was made longer don't count."""
+    run = RunFolder(tmp_path)
+    assert math.isnan(success_of(run.path))
+
+    def save(policy, frames, *outcomes):
+        same = {"policy": policy, "frames": frames, "evaluation": "final"}
+        run.save_episodes([episode(i, end, **same) for i, end in enumerate(outcomes)])
+
+    save("planner", 9, "success")
+    save("sampled", 9, "success", "timeout", "timeout", "timeout")
+    assert success_of(run.path) == 0.25
+    save("greedy", 5, "success")
+    save("greedy", 9, "success", "timeout")
+    assert success_of(run.path) == 0.5
 
 
 ENDS = [("success", "")] * 2 + [("collision", "pedestrian")] * 3 + [("collision", "car")]
