@@ -49,29 +49,14 @@ class Camera(pydantic.BaseModel):
         return [self.fx, self.fy, self.cx + shift, self.cy + shift]
 
 
-Row: TypeAlias = tuple[float, float, float, float]
-
-
-class ColourCamera(Camera):
-    """A second camera, to whose pixels depth is registered."""
-
-    colour_from_depth: tuple[Row, Row, Row, Row]
-
-
-class Cameras(Camera):
-    """The depth camera, and the colour camera if it is a separate one."""
-
-    colour: ColourCamera | None = None
-
-
-def read_cameras(path: Path) -> Cameras:
+def read_camera(path: Path) -> Camera:
     """Returns the content of an `intrinsics.json`."""
     remedy = (
         'it holds {"width": .., "height": .., "fx": .., "fy": .., "cx": .., "cy": .., '
         '"first_pixel_centre": 0 (as OpenCV calibrates) or 0.5}'
     )
     try:
-        return Cameras.model_validate_json(regular(path).read_text("utf-8-sig", "replace"))
+        return Camera.model_validate_json(regular(path).read_text("utf-8-sig", "replace"))
     except FileNotFoundError:
         raise SequenceError(path, f"no such file; {remedy}") from None
     except pydantic.ValidationError as error:

@@ -272,19 +272,14 @@ class DeclaredRecording(Recording):
 
     def _read_intrinsics(self) -> LeftOut:
         """Reads the numbers of K, and of depth's camera if it is another."""
-        self._size = self._colour_size = None
+        self._size = None
         source = self._path(self.intrinsics) if isinstance(self.intrinsics, str) else "intrinsics"
         if isinstance(self.intrinsics, str) and self.intrinsics.endswith(".json"):
-            cameras = calibration.read_cameras(self._path(self.intrinsics))
-            camera = cameras.colour or cameras
-            self._size = cameras.height, cameras.width
+            camera = calibration.read_camera(self._path(self.intrinsics))
+            self._size = camera.height, camera.width
             self.intrinsics, self.first_pixel_centre = camera.numbers, 0.5
             if not self.distortion:
                 self.distortion, self.lens = camera.distortion, camera.lens
-            if cameras.colour is not None:
-                self._colour_size = camera.height, camera.width
-                self.depth_intrinsics = cameras.numbers
-                self.colour_from_depth = np.ravel(cameras.colour.colour_from_depth).tolist()
         lacking, given = np.zeros(len(self._names), dtype=bool), self.intrinsics
         if isinstance(given, str) and ("*" in given or self.intrinsics_columns is not None):
             numbers, rows, *_ = self._rows(given, self.intrinsics_columns)
@@ -356,7 +351,6 @@ class DeclaredRecording(Recording):
         depth = geometry.adapt_depth(stored, self.depth_kind, **options)[0].numpy()
         pose = self._poses[i] if self.has_poses else None
         if self._depth_numbers is not None:
-            size = self._colour_size or size
             register = self._once(
                 calibration.Registration, K_depth, K, self._colour_from_depth, size
             )

@@ -26,7 +26,7 @@ Flow: TypeAlias = NDArray[np.float32]  # [2, H, W], u right, v down; nan where u
 _SUFFIXES = {
     "picture": (".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".bmp", ".tif", ".tiff", ".npy"),
     "map": (".png", ".npy", ".tif", ".tiff", ".pgm", ".pfm", ".exr", ".dpt"),
-    "flow": (".flo", ".png", ".npy", ".pfm", ".flo5"),
+    "flow": (".flo", ".png", ".npy", ".pfm"),
     "numbers": (".txt", ".csv", ".json", ".cam"),
 }
 FLO_TAG = 202021.25
@@ -79,8 +79,8 @@ def read_lines(path: Path) -> list[str]:
     return [line for line in lines if line and not line.startswith("#")]
 
 
-def read_table(path: Path, *columns: int) -> NDArray[np.float64]:
-    """Returns the numbers of a file, a row a line, with one of the permitted numbers of columns.
+def read_table(path: Path) -> NDArray[np.float64]:
+    """Returns the numbers of a file, a row a line.
 
     They are separated by blanks or commas; a line that begins with a word is a header. Of JSON,
     `path` ends in `file.json:key.key`; the numbers of several keys, with `+` between them, stand
@@ -109,9 +109,6 @@ def read_table(path: Path, *columns: int) -> NDArray[np.float64]:
         raise SequenceError(path, f"holds no table of numbers {keys}: {error!r}") from None
     if not table.size:
         raise SequenceError(path, "holds no numbers")
-    if columns and table.shape[1] not in columns:
-        expected = " or ".join(map(str, columns))
-        raise SequenceError(path, f"has {table.shape[1]} numbers in a line, expected {expected}")
     return table
 
 
@@ -131,8 +128,6 @@ def read_array(path: Path) -> NDArray[Any]:
                 array = values.reshape(height, width, 2 if suffix == ".flo" else 1)
         elif suffix == ".exr":
             array = _read_exr(path)
-        elif suffix == ".flo5":
-            raise SequenceError(path, "is HDF5, which isn't read: convert it to .flo or .npy")
         else:
             array = _decoded(regular(path).read_bytes())
     except (ValueError, EOFError, RuntimeError, struct.error, cv2.error) as error:

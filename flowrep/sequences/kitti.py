@@ -16,7 +16,6 @@ from flowrep.sequences.calibration import as_pose, camera_matrix
 from flowrep.sequences.recording import Frame, Pose, Recording, SequenceError
 
 EARTH_RADIUS_M = 6378137.0
-_OXTS_NUMBERS = 30
 
 
 class Kitti(Recording):
@@ -95,8 +94,8 @@ class Kitti(Recording):
             packets, first = self._oxts[int(pair)]
             # The map is true to scale at the latitude of the pair's first frame in time.
             before, path = (packets / f"{first + later:010d}.txt" for later in (0, not is_current))
-            latitude_deg = files.read_table(before, _OXTS_NUMBERS)[0, 0]
-            packet = files.read_table(path, _OXTS_NUMBERS)[0]
+            latitude_deg = files.read_table(before)[0, 0]
+            packet = files.read_table(path)[0]
             world_from_imu = _pose_from_oxts(packet, latitude_deg)
             world_from_cam = world_from_imu @ np.linalg.inv(cam_from_imu)
         flow: Any = {"raw": raw, "raw_since": since}

@@ -149,7 +149,6 @@ MISTAKES = [
     ("frames", "intrinsics.json", camera_json(fx=-31.0), "fx"),
     ("frames", "intrinsics.json", camera_json(fy=-27.0), "left-handed"),  # no camera axes turn it
     ("frames", "intrinsics.json", camera_json(first_pixel_centre=1), "first_pixel_centre"),
-    ("frames", "intrinsics.json", camera_json(colour={}), "colour_from_depth"),
     ("frames", "intrinsics.json", ["{"], "JSON"),
     ("tum", "rgb.txt", ["2.0 rgb/b.png", "1.0 rgb/a.png"], "backwards"),
     ("tum", "groundtruth.txt", ["2 0 0 0 0 0 0 1", "1 0 0 0 0 0 0 1"], "backwards"),
@@ -226,13 +225,6 @@ def test_a_pipe_is_refused_and_not_waited_for(name, tmp_path):
     finally:
         signal.alarm(0)
         signal.signal(signal.SIGALRM, previous)
-
-
-def test_flo5_is_named_as_what_it_is(tmp_path):
-    synthetic.write_frames(tmp_path)
-    (tmp_path / "flow/0001.flo").rename(tmp_path / "flow/0001.flo5")
-    says = refusal(lambda: sequences.open_recording(tmp_path, "frames"), "0001.flo5")
-    assert ".flo" in says
 
 
 def test_a_frame_that_a_table_lacks_is_left_out_and_named(tmp_path):
