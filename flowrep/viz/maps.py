@@ -99,12 +99,12 @@ def flow_to_rgb(flow: Any, scale_px: float) -> Image:
     return rgb
 
 
-def flow_wheel(size_px: int, background: tuple[int, int, int] = (255, 255, 255)) -> Image:
+def flow_wheel(size_px: int) -> Image:
     """Returns the legend of `flow_to_rgb`: a disc whose rim is the scale."""
     axis = np.linspace(-1, 1, size_px, dtype=np.float32)
     u, v = np.meshgrid(axis, axis)
     disc = flow_to_rgb(np.stack([u, v]), scale_px=1.0)
-    disc[np.hypot(u, v) > 1 + 1 / size_px] = background
+    disc[np.hypot(u, v) > 1 + 1 / size_px] = 255
     return disc
 
 
