@@ -54,7 +54,7 @@ from flowrep.report.runs import (
 )
 from flowrep.report.statistics import LEVEL, Array, Effect, Estimate, mean_share
 from flowrep.report.storage import read_archive
-from flowrep.report.tables import Table, p_text, percent, points, signed
+from flowrep.report.tables import p_text, percent, points, signed
 
 HERE = Path(__file__).parent
 DATA, PAGE = HERE.parent / "outputs" / "reference", HERE / "results.md"
@@ -75,7 +75,8 @@ def _as_trained(run: Run) -> Condition:
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    return Table("", "", tuple(header), (("", tuple(map(tuple, rows))),)).to_markdown()
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join(f"|{'|'.join(cells)}|" for cells in lines)
 
 
 def share(value: float) -> str:

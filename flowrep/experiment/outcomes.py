@@ -109,13 +109,13 @@ def _final(folder: Path) -> list[dict[str, str]]:
     return [row for row in rows if row["evaluation"] == "final"]
 
 
-def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Returns Wilson's score interval of a proportion; (0, 1) without trials."""
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """Returns Wilson's 95 % score interval of a proportion; (0, 1) without trials."""
     if not trials:
         return 0.0, 1.0
     # the proportions p from which the observed share is at most z standard errors away: the
     # solutions of (share - p)² = z² p (1 - p) / trials
-    z2 = NormalDist().inv_cdf(0.5 + confidence / 2) ** 2
+    z2 = NormalDist().inv_cdf(0.975) ** 2
     share = successes / trials
     centre = (share + z2 / (2 * trials)) / (1 + z2 / trials)
     half = (z2 * share * (1 - share) / trials + z2**2 / (4 * trials**2)) ** 0.5 / (1 + z2 / trials)
@@ -181,12 +181,12 @@ def print_results(rows: Sequence[Mapping[str, Any]]) -> None:
     print_table("Causes of failure in % of the failures", table)
 
 
-def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Prints rows that have the same keys, which are the headings."""
+def print_table(title: str, rows: Sequence[Mapping[str, Any]], least_width: int = 100) -> None:
+    """Prints rows with the same keys, the headings, in `least_width` columns or the terminal's."""
     table = Table(title=title, box=box.SIMPLE, pad_edge=False)
     for name in rows[0]:
         heading = name.replace("_", " ").replace(": ", ":\n")
-        is_number = all(str(row[name])[:1] in "-0123456789" for row in rows)
+        is_number = all(str(row[name])[:1] in "-+−<0123456789" for row in rows)
         # a policy's name may be a long path: it is folded, numbers are not
         table.add_column(
             heading,
@@ -197,5 +197,5 @@ def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     for row in rows:
         table.add_row(*map(str, row.values()))
     # names are text: a[b] is no markup, :car: no emoji
-    console = Console(width=max(100, Console().width), markup=False, emoji=False)
+    console = Console(width=max(least_width, Console().width), markup=False, emoji=False)
     console.print(table)

@@ -6,7 +6,6 @@ Slow imports wait until the config has been checked and the runs have been read.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from flowrep.extras import require
 
@@ -16,12 +15,10 @@ from flowrep.config import UsageError
 from flowrep.config.cli import run_command
 from flowrep.config.schema import ReportConfig
 
-if TYPE_CHECKING:
-    from flowrep.report.tables import Table
-
 
 def report(config: ReportConfig) -> Path:
     """Writes figures, tables and a page of runs; returns the page's path."""
+    from flowrep.experiment.outcomes import print_table
     from flowrep.report.storage import is_archive, read_runs, without_repeats
 
     folders = list(map(Path, config.run))
@@ -45,7 +42,9 @@ def report(config: ReportConfig) -> Path:
     for section in assembled.sections:
         for table in section.tables:
             if not table.name.endswith("_differences"):  # these are too long for a screen
-                show(table, f"{section.title} {section.label}".strip())
+                for block, rows in table.blocks:
+                    title = " ".join(filter(None, (section.title, section.label, block)))
+                    print_table(title, [dict(zip(table.header, row)) for row in rows], 160)
     output.mkdir(parents=True, exist_ok=True)
     for folder in write_files(assembled, output):
         print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
@@ -56,26 +55,6 @@ def report(config: ReportConfig) -> Path:
     page.write_text(render_page(assembled, drives), encoding="utf-8")
     print(f"page: {page}")
     return page
-
-
-def show(table: Table, title: str) -> None:
-    """Prints a table."""
-    import rich.box
-    import rich.table
-    from rich.console import Console
-    from rich.text import Text
-
-    heading = Text(title, style="table.title")  # rich reads brackets in a str as markup
-    shown = rich.table.Table(title=heading, box=rich.box.SIMPLE, pad_edge=False)
-    for name, side in zip(table.header, table.alignment):
-        shown.add_column(Text(name), justify="left" if side == "l" else "right", no_wrap=True)
-    for block, rows in table.blocks:
-        if block:
-            shown.add_row(Text(block, style="italic"))
-        for row in rows:
-            shown.add_row(*map(Text, row))
-        shown.add_section()
-    Console(width=max(160, Console().width)).print(shown)
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Tables as LaTeX (booktabs), Markdown and CSV, and numbers as text."""
+"""Tables as LaTeX (booktabs) and CSV, and numbers as text."""
 
 import csv
 import io
@@ -54,12 +54,6 @@ class Table(NamedTuple):
   \end{{tabular}}
 \end{{table}}
 """
-
-    def to_markdown(self) -> str:
-        """Returns a Markdown table, without the caption and the blocks' headings."""
-        rows = [row for _, block in self.blocks for row in block]
-        lines = [self.header, ["---"] * len(self.header), *rows]
-        return "\n".join(f"|{'|'.join(cells)}|" for cells in lines)
 
     def to_csv(self) -> str:
         """Returns a CSV table; a block's heading is its rows' first cell."""

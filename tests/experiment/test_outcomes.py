@@ -10,6 +10,7 @@ from flowrep.experiment.outcomes import (
     failure_causes,
     outcome_shares,
     print_results,
+    print_table,
     success_of,
     wilson_interval,
 )
@@ -106,9 +107,10 @@ def test_tables_show_shares_with_intervals_and_causes_and_nothing_is_cut_off(cap
 
 
 @pytest.mark.parametrize("name", ["a[/b]c", "x[red]y", "[link=x]z", "a:car:b"])
-def test_the_name_of_a_policy_is_printed_as_it_is(capsys, name):
+def test_the_names_of_policies_and_tables_are_printed_as_they_are(capsys, name):
     print_results(failed_rows(name))
-    assert capsys.readouterr().out.count(name) == 2  # in both tables
+    print_table(f"of {name}", [{"policy": "as wide as its title"}])
+    assert capsys.readouterr().out.count(name) == 3
 
 
 def test_the_table_of_causes_is_replaced(tmp_path):

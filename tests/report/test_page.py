@@ -13,12 +13,11 @@ pytest.importorskip("jinja2", reason="reports are an extra")
 
 from flowrep.config import CONF_DIR
 from flowrep.config.schema import ReportConfig
-from flowrep.report.__main__ import main, report, show
+from flowrep.report.__main__ import main, report
 from flowrep.report.figures import draw_bars, encoded
 from flowrep.report.page import DRIVES, drives_of, tracks_of
 from flowrep.report.runs import Condition, grid_of
 from flowrep.report.storage import read_run, read_runs
-from flowrep.report.tables import Table
 from tests.report.folders import config_of, letters, rows_of, run_in, write_run
 
 
@@ -112,11 +111,6 @@ def test_what_was_found_is_printed_and_where_it_was_written(tmp_path, monkeypatc
     assert "0.333 [0.048–2.326]" in said  # 1 out of bounds to 3 collisions; Wilson's of 1 of 4
     assert str(tmp_path / "out" / "index.html") in said
     assert (tmp_path / "out" / "index.html").is_file()
-
-
-def test_a_tables_title_may_hold_brackets(capsys):
-    show(Table("t", "", ("a column as wide as the title",), ()), "tau=[/red], scale=[1]")
-    assert capsys.readouterr().out.split("\n")[0].strip() == "tau=[/red], scale=[1]"
 
 
 # Drives and films.
