@@ -160,10 +160,6 @@ class StreetEnv(gym.Env):
             "before": _plain(episode.before),
         }
 
-    def set_state(self, state: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Restores a state from `get_state`; returns its observation and info."""
-        return self.reset(options={"state": state})
-
     def _resume(self, state: Mapping[str, Any]) -> None:
         self.np_random.bit_generator.state = state["np_random"]
         self._begin({name: state[name] for name in _OPTIONS})

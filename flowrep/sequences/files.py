@@ -249,9 +249,9 @@ def write_flo(path: Path, flow: Flow, valid: NDArray[np.bool_] | None = None) ->
     path.write_bytes(header + marked.astype("<f4").tobytes())
 
 
-def write_kitti_flow(path: Path, flow: Flow, valid: NDArray[np.bool_] | None = None) -> None:
+def write_kitti_flow(path: Path, flow: Flow) -> None:
     """Writes flow `[2, H, W]` in steps of 1/64 px; flow beyond 512 px is marked as unknown."""
-    known = np.isfinite(flow).all(0) & (valid is None or valid)
+    known = np.isfinite(flow).all(0)
     steps = np.rint(np.where(known, flow, 0.0) * 64) + 2**15
     known &= ((steps >= 0) & (steps < 2**16)).all(0)
     coded = np.where(known, steps, 0).astype(np.uint16)

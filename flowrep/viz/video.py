@@ -9,7 +9,7 @@ from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
@@ -37,8 +37,8 @@ class Video:
         self.path, self.fps = Path(path), fps
         self._partial = self.path.with_name(f"{self.path.stem}.tmp{self.path.suffix}")
         self._size = 0, 0
-        self._ffmpeg: subprocess.Popen[bytes] | None = None
-        self._messages: IO[bytes] | None = None
+        self._ffmpeg: Any = None  # the process, once it has started, and the file of its messages
+        self._messages: Any = None
 
     def append(self, image: Image) -> None:
         """Adds a frame `[H, W, 3]`."""
@@ -48,8 +48,6 @@ class Video:
         image = image[:height, :width]
         fill = ((0, height - image.shape[0]), (0, width - image.shape[1]), (0, 0))
         frame = np.pad(image, fill, constant_values=255)
-        assert self._ffmpeg is not None
-        assert self._ffmpeg.stdin is not None
         try:
             self._ffmpeg.stdin.write(frame.tobytes())
         except BrokenPipeError:
@@ -98,9 +96,6 @@ class Video:
 
     def _end(self) -> tuple[int, str]:
         """Waits for FFmpeg and returns its exit status and its last message."""
-        assert self._ffmpeg is not None
-        assert self._ffmpeg.stdin is not None
-        assert self._messages is not None
         with suppress(BrokenPipeError):
             self._ffmpeg.stdin.close()
         status = self._ffmpeg.wait()

@@ -56,7 +56,7 @@ def test_a_frame_is_named_by_its_episode_and_step(make_street):
     for step in (1, 2):
         observation = env.step(0)[0]
         assert observation["frame"].tolist() == [41, step]
-    again, _ = env.set_state(env.get_state())
+    again, _ = env.reset(options={"state": env.get_state()})
     assert again["frame"].tolist() == [41, 2]
 
 
@@ -231,7 +231,7 @@ def test_an_episode_may_have_a_speed_and_a_frame_rate_of_its_own(make_street):
     assert np.array_equal(shared.episode.poses, made_for.episode.poses)
     assert same(shared.step(RIGHT)[0], made_for.step(RIGHT)[0])
     resumed = make_street()
-    resumed.set_state(state)
+    resumed.reset(options={"state": state})
     assert same(resumed.step(RIGHT)[0], shared.sensing.observe(shared.episode))
     shared.reset(options={"episode_seed": 11})
     assert shared.episode.speed_mps == shared.scene.pedestrian_speed_mps["normal"]
@@ -247,7 +247,7 @@ def test_a_state_written_as_json_goes_on_bit_for_bit(make_street):
     before = env.sensing.observe(env.episode)
     state = json.loads(json.dumps(env.get_state()))
     resumed = make_street()
-    observation, info = resumed.set_state(state)
+    observation, info = resumed.reset(options={"state": state})
     assert same(observation, before)
     assert info["episode_seed"] == env.episode.seed
     for action in actions[6:]:
