@@ -5,6 +5,7 @@ What is expected is computed here from `getCameraImage`'s buffers, the projectio
 """
 
 import importlib.util
+import inspect
 import math
 import os
 
@@ -514,9 +515,9 @@ def test_mistakes_are_named(world, options, names):
 # Envs of others
 
 
-def panda(task="PandaReach-v3"):
+def panda():
     pytest.importorskip("panda_gym", reason="an env that others wrote: pip install panda-gym")
-    return gym.make(task)
+    return gym.make("PandaPush-v3")
 
 
 def bullet_env(name):
@@ -532,10 +533,6 @@ def on_hand(env):
     )
 
 
-def beside(env):
-    return BulletCamera(env.sim.physics_client, WIDTH, HEIGHT, fov_deg=60, view=VIEW, rgb=True)
-
-
 def chasing(env):
     def view():
         x, y, z = env.robot.body_xyz
@@ -547,8 +544,7 @@ def chasing(env):
 
 # Each with the number of a body that stands.
 ENVS = {
-    "panda, hand": (lambda: panda("PandaPush-v3"), on_hand, 2),
-    "panda, beside": (panda, beside, 2),
+    "panda, hand": (panda, on_hand, 2),
     "ant, chased": (lambda: bullet_env("AntBulletEnv-v0"), chasing, 0),
 }
 
@@ -663,11 +659,11 @@ def test_arrays_of_observations_get_a_name_and_a_name_that_is_taken_is_refused()
 
 # OpenGL, in a process of its own: a driver that fails may take its process with it
 
-EGL = """
-import importlib.util, sys
+EGL = f"""
+import importlib.util
 import numpy as np, pybullet
 from flowrep.pybullet import BulletCamera
-from tests.test_pybullet import box, heights
+{"".join(map(inspect.getsource, (box, column_major, heights)))}
 client = pybullet.connect(pybullet.DIRECT)
 plugin = importlib.util.find_spec("eglRenderer").origin
 assert pybullet.loadPlugin(plugin, "_eglRendererPlugin") >= 0

@@ -145,10 +145,7 @@ def test_a_refused_view_leaves_no_folder(tmp_path, monkeypatch, capsys):
         assert not [*tmp_path.iterdir()]
 
 
-def test_what_is_no_policy_or_path_is_named():
-    for config, key in ((asked("policy=pilot"), "policy=pilot"), (asked("path=up"), "path")):
-        with pytest.raises(UsageError, match=key):
-            driven(config)
+def test_a_policy_of_ones_own_needs_its_representations():
     with pytest.raises(UsageError, match="representations"):
         driven(asked("policy=mine:make"))
 
