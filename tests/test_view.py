@@ -1,6 +1,5 @@
 """`python -m flowrep.view` from start to pictures, and its window."""
 
-import subprocess
 import sys
 from contextlib import closing
 
@@ -40,11 +39,6 @@ SMALL = ["scene.camera.height_px=24", "scene.camera.width_px=32", "episodes=2", 
 NO_OP, LEFT, RIGHT = 0, 1, 2
 
 
-def view(*arguments):
-    command = [sys.executable, "-m", "flowrep.view", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-
-
 def options_of(config):
     return episodes_of(config, config.scene)
 
@@ -58,14 +52,14 @@ def asked(*overrides):
 
 
 @pytest.mark.slow
-def test_a_scene_is_driven_drawn_filmed_and_counted(tmp_path):
+def test_a_scene_is_driven_drawn_filmed_and_counted(tmp_path, monkeypatch):
     out = tmp_path / "seen"
-    short = ["scene=three_way_junction", "scene.time_limit_steps=40", "policy=never_turn"]
-    done = view(*short, *SMALL, f"output={out}")
-    assert done.returncode == 0, done.stderr
+    short = ["scene=three_way_junction", "scene.time_limit_steps=12", "policy=never_turn"]
+    monkeypatch.setattr(sys, "argv", ["view", *short, *SMALL, f"output={out}"])
+    main()
     assert {path.name for path in out.iterdir()} == {*FILES}
     first, second = read_rows(out / "episodes.csv")
-    assert (first["outcome"], first["hit"], first["length"]) == ("timeout", "", "40")
+    assert (first["outcome"], first["hit"], first["length"]) == ("timeout", "", "12")
     assert [first["episode_seed"], second["episode_seed"]] == ["0", "1"]
     seen = {row["category"]: int(row["pixels"]) for row in read_rows(out / "categories.csv")}
     assert len(seen) == 11
