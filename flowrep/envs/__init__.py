@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from flowrep.extras import require
 
-require("flowrep.envs", "sim", "pybullet", "gymnasium", "shapely", "yaml")
+require("flowrep.envs", "sim", "pybullet", "gymnasium", "shapely", "yaml", "numba")
 
 import gymnasium
 

@@ -46,8 +46,7 @@ class StreetEnv(gym.Env):
             seconds.
         sensors: the keys of the observation; without any, nothing is rendered.
         render_mode: "rgb_array" or None.
-        renderer: "rasteriser", whose colours are textured, "pybullet", or "auto": the rasteriser if
-            numba is installed.
+        renderer: "rasteriser" (or "auto"), whose colours are textured, or "pybullet".
         picture_scale: size of `rgb` and of rendered pictures, as a multiple of the maps'. Flow
             estimated from larger pictures and averaged is more accurate.
 

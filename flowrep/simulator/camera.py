@@ -7,14 +7,12 @@ Convention: camera axes are OpenCV's (x right, y down, z forward), pixel (0, 0)'
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrep.extras import numba_is_installed
 from flowrep.simulator.motion import rigid_inverse
 
 if TYPE_CHECKING:  # scenes need shapely and pydantic, which `flowrep.pybullet` shouldn't import
@@ -91,20 +89,10 @@ def depth_from_zbuffer(
 
 
 RENDERERS = ("auto", "rasteriser", "pybullet")
-_REMEDY = "run: pip install 'flowrep-rl[sim]'"
 
 
 def choose_renderer(name: str) -> str:
-    """Returns "rasteriser" or "pybullet"; "auto" is the rasteriser if numba is installed."""
+    """Returns "rasteriser" or "pybullet"; "auto" is the rasteriser."""
     if name not in RENDERERS:
         raise ValueError(f"unknown renderer {name!r}; choose one of {', '.join(RENDERERS)}")
-    if name == "pybullet" or numba_is_installed():
-        return "rasteriser" if name == "auto" else name
-    if name == "rasteriser":
-        raise ImportError(f"renderer 'rasteriser' needs numba; {_REMEDY}")
-    warnings.warn(
-        "numba is not installed, so PyBullet draws depth and ids: a picture of 84 x 84 pixels then "
-        f"takes about 2 ms instead of 0.2; {_REMEDY}",
-        stacklevel=2,
-    )
-    return "pybullet"
+    return "rasteriser" if name == "auto" else name
