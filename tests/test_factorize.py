@@ -177,7 +177,6 @@ def test_what_is_there_is_not_overwritten(folder, tmp_path):
     [
         (["start=2"], "start=2"),  # one frame alone
         (["flow=exact", "stride=2"], "0001.*0000"),  # flow of its own does not skip frames
-        (["format.flow_grid=previous"], "grid"),
         (["flow=exact", "poses=estimated"], r"depth/0002\.png"),  # broken
     ],
 )

@@ -87,7 +87,6 @@ class DeclaredRecording(Recording):
     flow_coding: files.FlowCoding
     flow_to: Literal["previous", "next"]
     flow_direction: geometry.Direction
-    flow_grid: geometry.Grid
     flow_channels: geometry.Channels
 
     def __post_init__(self) -> None:
@@ -398,8 +397,8 @@ class DeclaredRecording(Recording):
         stored = files.read_flow(self._file(pattern, "flow", name, next=other), self.flow_coding)
         # If it is read backwards, the next frame is the previous one.
         is_forward = (self.flow_direction == "forward") != (self.flow_to == "next")
-        options: Any = {"direction": "forward" if is_forward else "backward"}
-        options |= {"grid": self.flow_grid, "channels": self.flow_channels}
+        options: Any = {"grid": "current", "channels": self.flow_channels}
+        options |= {"direction": "forward" if is_forward else "backward"}
         raw: files.Flow = geometry.adapt_flow(torch.from_numpy(stored), **options).numpy()
         if self.flow_mask is not None:
             mask = self._file(self.flow_mask, "map", name, next=other)
