@@ -39,16 +39,8 @@ def test_a_hang_up_that_nohup_ignores_stays_ignored():
         signal.signal(signal.SIGHUP, before)
 
 
-@pytest.fixture
-def ctrl_c_raises():
-    """Python's own handler: a process started in the background may have SIGINT ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 @pytest.mark.parametrize("first", [[signal.SIGINT], [signal.SIGTERM, signal.SIGTERM]])
-def test_a_ctrl_c_after_a_signal_ends_at_once_and_another_sigterm_does_not(ctrl_c_raises, first):
+def test_a_ctrl_c_after_a_signal_ends_at_once_and_another_sigterm_does_not(first):
     with StopRequest() as stop:
         for number in first:
             os.kill(os.getpid(), number)

@@ -26,11 +26,6 @@ def test_gymnasium_finds_a_street_by_its_module():
     assert gymnasium.make(f"flowrep.envs:{ID}").unwrapped.scene.name == "straight_road"
 
 
-def test_a_window_that_can_not_open_is_refused_at_once():
-    with pytest.raises(ValueError, match="human"):
-        gymnasium.make(ID, render_mode="human")
-
-
 def test_maps_are_those_of_the_torchrl_env():
     env = gymnasium.make(ID, representations=ALL, joined=False)
     same = make_env("straight_road", ALL, num_envs=1)

@@ -209,51 +209,6 @@ def test_a_lost_quaternion_is_left_out_too(tmp_path):
         assert recording.notes[0].startswith("1 of 3")
 
 
-LAYOUTS = {"xyz_xyzw": [0, 1, 2, 3, 4, 5, 6], "xyz_wxyz": [0, 1, 2, 6, 3, 4, 5]} | {
-    "xyzw_xyz": [3, 4, 5, 6, 0, 1, 2]
-}
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_layouts_of_a_quaternion(layout, moments, tmp_path):
-    rows = [np.array(quaternion_line(m.world_from_cam).split())[LAYOUTS[layout]] for m in moments]
-    put(tmp_path / "poses.txt", [" ".join(row) for row in rows])
-    recording = open_frames(tmp_path, pose_layout=layout)
-    for frame, moment in zip(recording, moments, strict=True):
-        np.testing.assert_allclose(frame.world_from_cam, moment.world_from_cam, atol=1e-12)
-
-
-# Where OpenCV's right, down and forward lie in the axes of left-handed cameras.
-LEFT_HANDED = {
-    "unity": np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, 1]]),  # x right, y up, z forward
-    "unreal": np.array([[0.0, 0, 1], [1, 0, 0], [0, -1, 0]]),  # x forward, y right, z up
-}
-
-
-@pytest.mark.parametrize("axes", LEFT_HANDED)
-@pytest.mark.parametrize("direction", ["camera_to_world", "world_to_camera"])
-def test_left_handed_poses_give_the_same_motion(axes, direction, moments, tmp_path):
-    mirror, given_from_opencv = np.diag([1.0, 1.0, -1.0, 1.0]), np.eye(4)
-    given_from_opencv[:3, :3] = LEFT_HANDED[axes]
-    poses = [mirror @ m.world_from_cam @ np.linalg.inv(given_from_opencv) for m in moments]
-    assert all(np.linalg.det(pose) > 0 for pose in poses)
-    poses = [np.linalg.inv(p) if direction == "world_to_camera" else p for p in poses]
-    put(tmp_path / "poses.txt", map(numbers, poses))
-    recording = open_frames(tmp_path, pose_axes=axes, pose_direction=direction)
-    for frame in recording:  # the world is mirrored, too
-        assert np.linalg.det(frame.world_from_cam) == pytest.approx(1)
-    truth = iter(moments[1:])
-    _, *pairs = factorize_frames(recording, lambda a, b: next(truth).raw)
-    for made, moment in zip(pairs, moments[1:], strict=True):
-        assert np.abs(made.obj - moment.obj).max() < 2e-4
-
-
-def test_a_negative_fy_is_refused_with_the_mirror(tmp_path):
-    synthetic.write_tum(tmp_path)
-    with pytest.raises(SequenceError, match="pose_axes=unity"):
-        open_recording(tmp_path, "tum", intrinsics=[481.2, -480.0, 319.5, 239.5])
-
-
 @pytest.mark.parametrize("count", [7, 12, 16])
 def test_poses_of_a_marker_and_poses_that_lag(count, moments, tmp_path):
     marker_from_cam = synthetic.rigid((0.1, -0.2, 0.3), (0.05, 0.12, -0.02)).numpy()

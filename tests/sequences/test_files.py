@@ -87,20 +87,6 @@ def test_a_picture_that_was_cut_off_is_refused(suffix, kept, tmp_path):
     refusal(lambda: sequences.open_recording(tmp_path, "frames"), path.name)
 
 
-def test_depth_that_is_nan_is_missing(tmp_path):
-    synthetic.write_frames(tmp_path)
-    for i, path in enumerate(sorted((tmp_path / "depth").iterdir())):
-        depth = np.full((24, 40), 2.0, np.float32)
-        depth[i] = np.nan
-        path.unlink()
-        np.save(path.with_suffix(".npy"), depth)
-    frames = list(sequences.open_recording(tmp_path, "frames"))
-    assert [np.argwhere(np.isnan(f.depth).all(1)).item() for f in frames] == [0, 1, 2]
-    # A unit that is given holds for arrays too: 2.0 in decimetres.
-    scaled = sequences.open_recording(tmp_path, "frames", depth_unit_m=0.1)
-    assert scaled[0].depth[5, 5] == pytest.approx(0.2)
-
-
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_names_a_file_that_is_missing_or_empty(name, tmp_path):
     write, open_it, *_ = FORMATS[name]

@@ -1,4 +1,4 @@
-"""Recordings whose camera changes from frame to frame, or that lack some poses."""
+"""Recordings whose camera changes from frame to frame."""
 
 from __future__ import annotations
 
@@ -14,17 +14,6 @@ import imageio.v3 as imageio
 from flowrep.sequences import factorize_frames, open_recording, recorded_flow
 from tests.sequences import synthetic
 from tests.sequences.synthetic import HEIGHT, WIDTH, K, make_moments, put, quaternion_line
-
-
-def test_what_is_lost_is_left_out_and_counted(tmp_path):
-    synthetic.write_scannet(tmp_path / "scannet")
-    (note,) = open_recording(tmp_path / "scannet", "scannet").notes
-    assert "1 of 3" in note
-    synthetic.write_icl_nuim(tmp_path / "icl")
-    poses = {"poses": "livingRoom2.gt.freiburg"}
-    recording = open_recording(tmp_path / "icl", "icl_nuim", **poses)
-    assert [frame.name for frame in recording] == ["10", "11"]
-    assert "1 of 3" in recording.notes[0]
 
 
 def brute_force(depth, K, pose, K_before, pose_before):

@@ -136,18 +136,3 @@ def test_neighbouring_triangles_leave_no_gap():
     around = 1 + np.arange(60)
     triangles = np.stack([np.zeros(60, int), np.roll(around, -1), around], axis=1)
     assert np.isfinite(see(Body(vertices, triangles, *WALL))[0]).all()
-
-
-def test_chunks_hold_every_triangle_once():
-    rng = np.random.default_rng(0)
-    vertices, corners = rng.normal(size=(300, 3)), rng.integers(300, size=(200, 3))
-    triangles = gather([Body(vertices, corners, *WALL)])
-    assert len(triangles.bodies) > 4
-    regained = []
-    for c in range(len(triangles.bodies)):
-        points = triangles.points[triangles.point_bounds[c] : triangles.point_bounds[c + 1]]
-        own = triangles.corners[triangles.corner_bounds[c] : triangles.corner_bounds[c + 1]]
-        regained += points[own].tolist()
-        distances = np.linalg.norm(points - triangles.centres[c], axis=1)
-        assert distances.max() <= triangles.radii[c] * (1 + 1e-12)
-    assert sorted(regained) == sorted(vertices[corners].tolist())
