@@ -80,13 +80,9 @@ def factorize_recording(config: FactorizeConfig) -> int:
 
 def open_stream(config: FactorizeConfig) -> sequences.Stream:
     """Returns the recording or camera that `input` and `format` name."""
-    from flowrep import sequences
-
-    reader, options, source = get_class(config.format.target), config.format.options(), config.input
+    reader, options = get_class(config.format.target), config.format.options()
     check_options(reader, options, "format")
-    if issubclass(reader, sequences.Recording) and not Path(str(source)).is_dir():
-        raise sequences.SequenceError(source, "no such folder")
-    return reader(str(source), **options)
+    return reader(str(config.input), **options)
 
 
 def open_flow_source(config: FactorizeConfig, stream: sequences.Stream) -> FlowSource:
