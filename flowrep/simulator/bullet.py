@@ -50,8 +50,6 @@ class Simulator:
 
     def __init__(self, texture_rgb: NDArray[np.uint8]) -> None:  # [S, S, 3], of all meshes
         self._client = pybullet.connect(pybullet.DIRECT)
-        if self._client < 0:
-            raise RuntimeError("PyBullet has no client left: close some envs first")
         weakref.finalize(self, pybullet.disconnect, self._client)
         # PyBullet reads textures only from files, with v counted upwards from the bottom row. A TGA
         # file is an 18-byte header and the pixels as BGR.
