@@ -93,6 +93,8 @@ class DeclaredRecording(Recording):
         self.folder = Path(self.folder)
         for key in [key for key, value in vars(self).items() if value == "needed"]:
             raise ValueError(f"{key} needs a value")
+        if self.depth_unit_m is not None and not self.depth_unit_m > 0:
+            raise ValueError(f"depth_unit_m is positive, got {self.depth_unit_m}")
         self.has_flow, self.no_flow = self._flow_fits()
         depths, depth_times_s = self._listing(self.depth, "map")
         times_s, listed, rgb, self._video = depth_times_s, depths, self._path(self.rgb or "x"), None

@@ -26,7 +26,7 @@ Flow: TypeAlias = NDArray[np.float32]  # [2, H, W], u right, v down; nan where u
 _SUFFIXES = {
     "picture": (".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".bmp", ".tif", ".tiff", ".npy"),
     "map": (".png", ".npy", ".tif", ".tiff", ".pgm", ".pfm", ".exr", ".dpt"),
-    "flow": (".flo", ".png", ".npy", ".pfm"),
+    "flow": (".flo", ".png", ".npy", ".pfm", ".flo5"),
     "numbers": (".txt", ".csv", ".json", ".cam"),
 }
 FLO_TAG = 202021.25
@@ -128,6 +128,8 @@ def read_array(path: Path) -> NDArray[Any]:
                 array = values.reshape(height, width, 2 if suffix == ".flo" else 1)
         elif suffix == ".exr":
             array = _read_exr(path)
+        elif suffix == ".flo5":
+            raise SequenceError(path, "is HDF5, which isn't read: convert it to .flo or .npy")
         else:
             array = _decoded(regular(path).read_bytes())
     except (ValueError, EOFError, RuntimeError, struct.error, cv2.error) as error:

@@ -213,6 +213,19 @@ def test_a_pipe_is_refused_and_not_waited_for(name, tmp_path):
         signal.signal(signal.SIGALRM, previous)
 
 
+def test_flo5_is_named_as_what_it_is(tmp_path):
+    synthetic.write_frames(tmp_path)
+    (tmp_path / "flow/0001.flo").rename(tmp_path / "flow/0001.flo5")
+    says = refusal(lambda: sequences.open_recording(tmp_path, "frames"), "0001.flo5")
+    assert ".flo" in says
+
+
+def test_a_unit_of_depth_is_positive(tmp_path):
+    synthetic.write_frames(tmp_path)
+    with pytest.raises(ValueError, match="depth_unit_m"):
+        sequences.open_recording(tmp_path, "frames", depth_unit_m=-0.001)
+
+
 def test_a_frame_that_a_table_lacks_is_left_out_and_named(tmp_path):
     synthetic.write_vkitti2(tmp_path)
     path = tmp_path / "extrinsic.txt"
