@@ -342,10 +342,13 @@ EXPECTED = {
 
 @pytest.mark.parametrize("format", EXPECTED)
 def test_a_wrong_folder_is_told_what_was_expected(format, tmp_path):
-    with pytest.raises(SequenceError) as refused:
-        open_recording(tmp_path, format)
-    assert EXPECTED[format] in str(refused.value)
-    assert "Errno" not in str(refused.value)
+    file = tmp_path / "file"
+    file.touch()
+    for folder in (tmp_path, file):
+        with pytest.raises(SequenceError) as refused:
+            open_recording(folder, format)
+        assert EXPECTED[format] in str(refused.value)
+        assert "Errno" not in str(refused.value)
 
 
 def test_a_format_of_ones_own_says_what_is_different(moments, tmp_path, monkeypatch):

@@ -116,6 +116,8 @@ class StreetEnv(gym.Env):
         super().reset(seed=seed)
         options = options or {}
         if "state" in options:
+            if others := sorted(options.keys() - {"state"}):
+                raise ValueError(f"reset options {others} can't be given with state; leave them out")
             self._resume(options["state"])
         else:
             self._begin({"episode_seed": int(self.np_random.integers(1 << 31))} | options)
@@ -176,10 +178,13 @@ class StreetEnv(gym.Env):
             vehicle_speed_mps = self.scene.vehicle.speed_mps
         if not 0 <= vehicle_speed_mps < math.inf:
             raise ValueError(f"vehicle_speed_mps is {vehicle_speed_mps}; give m/s, 0 for rest")
+        episode_seed = operator.index(options["episode_seed"])
+        if not 0 <= episode_seed < 1 << 63:  # TensorDicts hold it as int64
+            raise ValueError(f"episode_seed is {episode_seed}; give 0 to 2**63 - 1")
         self._episode = Episode(
             self._street.layout,
             checked_frame_rate(self.scene, options.get("frame_rate_hz", self.frame_rate_hz)),
-            operator.index(options["episode_seed"]),
+            episode_seed,
             _speed_range(self.scene, options.get("speed", self.speed_mps)),
             float(vehicle_speed_mps),
             options.get("path"),
@@ -201,7 +206,10 @@ def _speed_range(scene: Scene, speed: SpeedMode | Range) -> Range:
             modes = ", ".join(scene.pedestrian_speed_mps)
             raise ValueError(f"unknown speed {speed!r}; choose one of {modes}, or give (low, high)")
         return scene.pedestrian_speed_mps[speed]
-    low, high = (float(bound) for bound in speed)
+    try:
+        low, high = (float(bound) for bound in speed)
+    except (TypeError, ValueError):  # not two numbers
+        low = high = math.nan
     if not 0 <= low <= high < math.inf:
         raise ValueError(f"speed is {speed!r}; give (lowest, highest) in m/s, or a mode's name")
     return low, high

@@ -165,9 +165,9 @@ class DeclaredRecording(Recording):
                 times = [float(time) for time, _ in lines]
                 if len(found) < len(times):
                     raise ValueError("two pictures have the same name")
-        except (ValueError, FileNotFoundError) as error:
+        except (ValueError, FileNotFoundError, NotADirectoryError) as error:
             remedy = f"give the folder whose {path.name} has '<time> <file>' in each line"
-            says = "is missing" if isinstance(error, FileNotFoundError) else error
+            says = "is missing" if isinstance(error, OSError) else error
             raise SequenceError(path, f"{says}: {remedy}, or its format=") from None
         if not found:
             used = (self.rgb, self.depth, self.flow, self.poses, self.intrinsics)

@@ -243,6 +243,8 @@ def test_an_episode_may_have_a_speed_and_a_frame_rate_of_its_own(make_street):
     [
         ({"speed": "fast"}, r"unknown speed 'fast'.* low, normal, high"),
         ({"speed": (2.0, 1.0)}, r"speed is \(2.0, 1.0\)"),
+        ({"speed": (1.0,)}, r"speed is \(1.0,\)"),
+        ({"speed": None}, "speed is None"),
         ({"frame_rate_hz": 0}, r"frame_rate_hz is 0.0"),
         ({"sensors": ("depth", "lidar")}, r"unknown sensors \['lidar'\].* depth, "),
         ({"renderer": "pybullet", "picture_scale": 2}, "picture_scale=2 needs"),
@@ -270,12 +272,17 @@ def test_reset_options_that_cannot_be_are_refused(make_street, empty_road):
         ("start", 3, r"unknown reset options \['start'\]"),
         ("path", "left", r"path 'left'.*\['main'\]"),
         ("episode_seed", 1.7, "float"),
+        ("episode_seed", -1, "episode_seed is -1"),
+        ("episode_seed", 1 << 63, "episode_seed is 9223372036854775808"),
         ("vehicle_speed_mps", math.nan, "vehicle_speed_mps is nan"),
         ("vehicle_speed_mps", -10.0, "vehicle_speed_mps is -10.0"),
         ("speed", (1.0, math.nan), r"speed is \(1.0, nan\)"),
     ):
         with pytest.raises((ValueError, TypeError), match=message):
             env.reset(options={option: value})
+    state = env.reset(seed=0) and env.get_state()
+    with pytest.raises(ValueError, match="path.*state"):  # it would be ignored
+        env.reset(options={"state": state, "path": "main"})
     last = (1 << 31) - 1
     assert env.reset(options={"episode_seed": np.int64(last)})[1]["episode_seed"] == last
 
