@@ -54,7 +54,9 @@ Workers = CountOrZero | Literal["auto"]
 
 
 def _distinct(values: Any) -> Any:
-    if isinstance(values, list) and any(value in values[:i] for i, value in enumerate(values)):
+    # A tuple comes from Python, a list from a config.
+    is_list = isinstance(values, list | tuple)
+    if is_list and any(value in values[:i] for i, value in enumerate(values)):
         raise ValueError("a value is repeated")
     return values
 
@@ -157,6 +159,14 @@ class Trusted(Options):
 # The commands.
 
 
+class Machine(Options):
+    """Where an agent from Python runs: arguments of `Agent.load`."""
+
+    device: Device
+    num_envs: Count | None
+    num_workers: Workers
+
+
 class EnvConfig(Command):
     """The keys from which an env is built."""
 
@@ -252,7 +262,7 @@ class TrainConfig(EnvConfig):
 class EvaluateConfig(Command):
     """The whole config of `flowrep.evaluate`."""
 
-    run: Annotated[list[Text] | None, OneOrMore]
+    run: Annotated[Annotated[list[Text], Field(min_length=1)] | None, OneOrMore]
     algorithm: Trusted
     scene: Scene | None = None
     representations: Stack | None = None

@@ -20,6 +20,7 @@ from flowrep.config.schema import (
     EnvConfig,
     Episodes,
     ExactFlow,
+    Machine,
     Noise,
     TrainConfig,
     check_policy,
@@ -127,12 +128,14 @@ class Agent(Driver):
             CheckpointError: a file is damaged, or the agent can't act in this scene.
         """
         check_policy(name := str(name))
-        machine: dict[str, Any] = {"device": device, "num_workers": num_workers}
-        machine |= {} if num_envs is None else {"num_envs": num_envs}
+        where = {"device": str(device), "num_envs": num_envs, "num_workers": num_workers}
+        machine = {k: v for k, v in validated(Machine, where) if v is not None}
         given_scene = None if scene is None else load_scene(scene)
         is_folder = Path(name).is_dir()  # of a run, whose name may hold a colon
         is_saved = not is_folder and name.endswith(".safetensors")
         is_external = not (is_folder or is_saved) and (":" in name or name.endswith(".pt2"))
+        if isinstance(representations, str):
+            raise UsageError(f"representations: give a list, ['{representations}']")
         if representations is None or isinstance(representations, Mapping):
             maps = dict(representations or {})
         else:

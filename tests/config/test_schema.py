@@ -120,6 +120,7 @@ def test_representations_keep_the_order_of_the_command_line():
     [
         ("", "run"),
         ("run=3", "run"),
+        ("run=[]", "run"),
         ("run=here policy=mine.py:make scene=s_turn representations=[ego]", "policy=mine.py:make"),
         ("run=here output=out", "output"),
         ("run=here speed=[]", "speed"),
