@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 
 _EPISODE = ("scene", "scene_id", "frames", "evaluation", "policy", "speed", "fps", "episode_seed")
 """The columns that identify a row of evaluation.csv."""
-_DRIVE = ("scene_id", "evaluation", "frames", "policy", "speed", "fps", "episode_seed", "outcome")
-"""The columns of drives.npz."""
+_DRIVE = ("scene_id", "evaluation", "frames", "policy", "speed", "fps", "episode_seed")
+"""The columns that identify an episode of drives.npz."""
 
 _IDENTITY = (
     "scene", "representations", "flow", "motion", "noise", "algorithm", "speed", "seed", "num_envs",
@@ -265,23 +265,27 @@ class RunFolder:
         """Adds the vehicles' positions to drives.npz; they replace those of the same episodes.
 
         It holds `positions` [sum of T + 1, 2], x and y in metres; `starts` [N + 1], so that episode
-        n is `positions[starts[n]:starts[n + 1]]`; and the columns that name each episode.
+        n is `positions[starts[n]:starts[n + 1]]`; the columns that identify each episode; and its
+        `outcome`.
         """
         drives = self._read_drives()
-        drives |= {tuple(getattr(each, c) for c in _DRIVE): each.positions for each in records}
+        for each in records:
+            drives[tuple(getattr(each, name) for name in _DRIVE)] = each.outcome, each.positions
+        outcomes, positions = zip(*drives.values())
         arrays: dict[str, Any] = {name: np.array(all_) for name, all_ in zip(_DRIVE, zip(*drives))}
-        arrays["positions"] = np.concatenate([*drives.values()])
-        arrays["starts"] = np.cumsum([0, *map(len, drives.values())])
+        arrays["outcome"], arrays["positions"] = np.array(outcomes), np.concatenate(positions)
+        arrays["starts"] = np.cumsum([0, *map(len, positions)])
         replace_file(self.drives_path, lambda path: np.savez_compressed(path, **arrays))
 
-    def _read_drives(self) -> dict[tuple[Any, ...], NDArray[np.float32]]:
-        """Returns positions in drives.npz by the episodes' columns; sets a damaged file aside."""
+    def _read_drives(self) -> dict[tuple[Any, ...], tuple[str, NDArray[np.float32]]]:
+        """Returns outcomes and positions in drives.npz by episode; sets a damaged file aside."""
         if not self.drives_path.is_file():
             return {}
         try:
             with np.load(self.drives_path, allow_pickle=False) as saved:
                 names = zip(*(saved[column].tolist() for column in _DRIVE), strict=True)
-                driven = np.split(saved["positions"], saved["starts"][1:-1])
+                positions = np.split(saved["positions"], saved["starts"][1:-1])
+                driven = zip(saved["outcome"].tolist(), positions, strict=True)
                 return dict(zip(names, driven, strict=True))
         except Exception as error:  # zip, zlib and numpy fail on garbage in a dozen ways
             set_aside(self.drives_path, error)

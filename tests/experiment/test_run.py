@@ -521,9 +521,12 @@ def test_damaged_drives_cost_no_episode_and_are_set_aside(tmp_path, capsys, dama
 def test_whole_drives_are_added_to(tmp_path):
     run = RunFolder(tmp_path)
     run.log_episodes([episode(1)], drives=True)
-    again = [episode(2, positions=2 * ROAD), episode(1, positions=3 * ROAD)]
+    again = [episode(2, positions=2 * ROAD), episode(1, positions=3 * ROAD, outcome="timeout")]
     run.log_episodes(again, drives=True)
     assert drives(run) == {1: (3 * ROAD).tolist(), 2: (2 * ROAD).tolist()}
+    with np.load(run.drives_path) as saved:  # once, though it ended differently, as elsewhere
+        assert dict(zip(saved["episode_seed"], saved["outcome"])) == {1: "timeout", 2: "collision"}
+        assert len(saved["outcome"]) == 2
 
 
 def test_episodes_are_saved_before_their_drives(tmp_path, monkeypatch):
