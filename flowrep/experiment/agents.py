@@ -29,17 +29,21 @@ from flowrep.config.schema import (
 )
 from flowrep.envs import street_envs
 from flowrep.experiment import build
-from flowrep.experiment.evaluation import Driver, PairedEvaluation
+from flowrep.experiment.evaluation import (
+    EVALUATION_ENVS,
+    FIRST_SEEDS,
+    Driver,
+    PairedEvaluation,
+)
 from flowrep.experiment.external import Task, check_card, load_policy
 from flowrep.experiment.outcomes import EpisodeRecord
 from flowrep.experiment.run import RunFolder, origin_of
-from flowrep.experiment.runner import EVALUATION_ENVS, Runner
+from flowrep.experiment.runner import Runner
 from flowrep.progress import StopRequest
 from flowrep.scenes import Scene, load_scene
 
 PRETRAINED = Path(__file__).parents[1] / "pretrained"
 """Agents that come with flowrep, one for each scene; README.md there is their card."""
-EVALUATION_SEED = 2_000_000  # of the first episode, as in conf/evaluate.yaml
 _SCALE = ".scale"
 
 
@@ -181,7 +185,7 @@ class Agent(Driver):
         *,
         speeds: Sequence[str] = (),
         fps: Sequence[float] = (),
-        seed: int = EVALUATION_SEED,
+        seed: int = FIRST_SEEDS["evaluate"],
         policies: Sequence[str] = ("greedy",),
         baselines: Sequence[str] = (),
     ) -> list[EpisodeRecord]:

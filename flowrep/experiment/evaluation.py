@@ -30,6 +30,13 @@ from flowrep.scenes import Scene
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
+FIRST_SEEDS = {"training": 1_000_000, "final": 1_500_000, "evaluate": 2_000_000}
+"""The seed of the first episode of each kind of evaluation, far enough apart that none overlap.
+
+The keys are the values of the column `evaluation`; conf/evaluate.yaml has the last seed, too.
+"""
+EVALUATION_ENVS = 192  # side by side: more make a step of each cheaper
+
 _BLIND: dict[str, Any] = {"representations": {}, "noise": None, "num_workers": 0, "device": "cpu"}
 """Changes to the env for baselines, which read the simulator's state instead of observations."""
 _DRAWS = 1  # separates a policy's draws from other draws that use the episode's seed

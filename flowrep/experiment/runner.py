@@ -27,14 +27,15 @@ from flowrep.config.schema import TrainConfig
 from flowrep.envs import begin_step, get_states, has_spare_cores, set_states
 from flowrep.envs.workers import sheltered
 from flowrep.experiment import build
-from flowrep.experiment.evaluation import Driver, PairedEvaluation
+from flowrep.experiment.evaluation import (
+    EVALUATION_ENVS,
+    FIRST_SEEDS,
+    Driver,
+    PairedEvaluation,
+)
 from flowrep.experiment.outcomes import OUTCOMES, print_results
 from flowrep.experiment.run import RunFolder, machine_of, origin_of
 from flowrep.progress import Every, StopRequest, Stopwatch, progress_bar
-
-EVALUATION_ENVS = 192  # side by side at least: more make a step of each cheaper
-EVALUATION_SEED = 1_000_000  # of the first episode evaluated during training
-FINAL_SEED = 1_500_000  # not the episodes evaluated during training
 
 
 class Runner:
@@ -160,10 +161,10 @@ class Runner:
         """
         config, asked, fps = self.config, self.config.evaluation, self.env.base_env.frame_rate_hz
         if kind == "final":
-            episodes = asked.speeds, asked.fps, asked.final_episodes, FINAL_SEED
+            episodes = asked.speeds, asked.fps, asked.final_episodes, FIRST_SEEDS[kind]
             evaluation = PairedEvaluation(*episodes, asked.policies, asked.baselines)
         else:
-            evaluation = PairedEvaluation([config.speed], [fps], asked.episodes, EVALUATION_SEED)
+            evaluation = PairedEvaluation([config.speed], [fps], asked.episodes, FIRST_SEEDS[kind])
         driver = Driver(self.agent.policy, config, self.frames)
         with self.clock("evaluation"), torch.random.fork_rng(devices=[]):
             num_envs = max(EVALUATION_ENVS, config.num_envs)
@@ -191,7 +192,7 @@ class Runner:
         path = self.folder.video_path(f"episode_{self.config.speed}")
         if self.config.evaluation.video and not is_playable(path):
             driver = Driver(self.agent.policy, self.config, self.frames)
-            record_episode(driver, path, episode_seed=FINAL_SEED)
+            record_episode(driver, path, episode_seed=FIRST_SEEDS["final"])
             print(f"video: {path}")
 
     def close(self) -> None:
