@@ -23,11 +23,11 @@ Studies = Mapping[str, Mapping[str, Sequence[Run]]]
 
 
 def studies_of(declared: Mapping[str, Any], runs: Sequence[Run]) -> Studies:
-    """Returns the finished runs of each study and scene, if there are any."""
+    """Returns the runs, trained to the end, of each study and scene, if there are any."""
 
     def finished(patterns: str) -> list[Run]:
         asked = [r for r in runs if any(fnmatch(r.name, p) for p in patterns.split())]
-        return [run for run in asked if run.is_finished]
+        return [run for run in asked if run.is_trained]
 
     return {
         study: {s: of for s, patterns in of_scenes.items() if (of := finished(patterns))}

@@ -117,7 +117,7 @@ class StreetEnv(gym.Env):
         options = options or {}
         if "state" in options:
             if others := sorted(options.keys() - {"state"}):
-                raise ValueError(f"reset options {others} can't be given with state; leave them out")
+                raise ValueError(f"reset options {others} can't be combined with state")
             self._resume(options["state"])
         else:
             self._begin({"episode_seed": int(self.np_random.integers(1 << 31))} | options)

@@ -38,7 +38,7 @@ def env(config: EnvConfig, **changes: Any) -> EnvBase:
     num_envs = changes.get("num_envs", config.num_envs)
     num_workers = changes.get("num_workers", config.num_workers)
     if num_workers == "auto":
-        num_workers = worker_count(num_envs, busy_cores=_threads(config))
+        num_workers = worker_count(num_envs, busy_cores=_busy_cores(config))
     arguments: dict[str, Any] = {
         "scene": config.scene,
         "representations": config.representations,
@@ -150,7 +150,7 @@ def worker_count(num_envs: int, busy_cores: int = 0) -> int:
     return 0 if is_in_pool or min(cores, num_envs) < 2 else min(cores - busy_cores, num_envs)
 
 
-def _threads(config: EnvConfig) -> int:
+def _busy_cores(config: EnvConfig) -> int:
     """Returns the number of cores that a training's updates use."""
     if not isinstance(config, TrainConfig) or device(config.device).type != "cpu":
         return 0

@@ -111,6 +111,7 @@ def _final(folder: Path) -> list[dict[str, str]]:
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     """Returns Wilson's 95 % score interval of a proportion; (0, 1) without trials."""
+    # Reports take it from scipy, which a training needn't have installed.
     if not trials:
         return 0.0, 1.0
     # the proportions p from which the observed share is at most z standard errors away: the

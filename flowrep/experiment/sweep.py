@@ -27,9 +27,10 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from flowrep.config import UsageError, cli
-from flowrep.config.schema import ALGORITHMS, TrainConfig, validated, validated_run
+from flowrep.config.schema import TrainConfig, validated, validated_run
 from flowrep.experiment.outcomes import is_finished, success_of
 from flowrep.files import open_to_append
+from flowrep.options import ALGORITHMS
 from flowrep.progress import STOP_SIGNALS, StopRequest
 from flowrep.yaml_file import read_yaml
 
@@ -169,7 +170,7 @@ def _sum_up(folder: Path, states: Mapping[str, str]) -> None:
 def job(config: DictConfig) -> float:
     """Runs what remains of one run in a separate process; called by Hydra's launchers.
 
-    Returns its final greedy success; nan if a run of a grid has none, so that the others go on.
+    Returns its final success; nan if a run of a grid has none, so that the others go on.
     """
     hydra = HydraConfig.get()
     folder, sweep = Path(hydra.runtime.output_dir), Path(hydra.sweep.dir)

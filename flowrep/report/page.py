@@ -19,7 +19,8 @@ from flowrep.report.sections import Report
 from flowrep.report.tables import listed
 from flowrep.scenes import SceneError, load_scene
 from flowrep.scenes.layout import Layout
-from flowrep.viz.plan import OUTCOME_COLOURS, Track, draw_plan
+from flowrep.viz import OUTCOME_COLOURS
+from flowrep.viz.plan import Track, draw_plan
 
 DRIVES = "drives.npz"
 TEMPLATES = Environment(
@@ -57,12 +58,12 @@ def drives_of(runs: Sequence[Run], *, trajectories: int, videos: int) -> Drives:
         videos: the number of films of an agent.
     """
     drives = Drives({}, {}, [])
-    finished: dict[Any, Run] = {}
+    shown: dict[Any, Run] = {}
     for number, group in enumerate(groups_of(runs)):
         for run in sorted(group.runs, key=lambda run: run.seed):
-            if run.is_finished:
-                finished.setdefault((number, run.scene, run.stack), run)
-    for run in finished.values():
+            if run.is_trained:
+                shown.setdefault((number, run.scene, run.stack), run)
+    for run in shown.values():
         scene, title = words(run.scene), f"{run.stack}, seed {run.seed} ({Path(run.name).name})"
         tracks = tracks_of(run, trajectories)
         if tracks:
@@ -142,9 +143,9 @@ def render_page(report: Report, drives: Drives) -> str:
 
 def summary(runs: Sequence[Run]) -> str:
     """Returns a sentence on the runs that were read."""
-    finished, episodes = sum(r.is_finished for r in runs), sum(r.tested.sum() for r in runs)
+    trained, episodes = sum(r.is_trained for r in runs), sum(r.tested.sum() for r in runs)
     stacks, scenes = sorted({run.stack for run in runs}), map(words, scenes_of(runs))
     return (
-        f"Runs: {len(runs)}, {finished} of them finished; stacks: {listed(stacks)}, in "
+        f"Runs: {len(runs)}, {trained} of them trained to the end; stacks: {listed(stacks)}, in "
         f"{listed([*scenes])}; evaluated episodes: {episodes:,}, those of baselines included."
     )

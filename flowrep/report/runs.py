@@ -60,7 +60,7 @@ class Run:
         self.total_frames = int(config["total_frames"])
         columns = (self.metrics.get("frames", np.zeros(0)), self.episodes["frames"])
         self.frames = max((int(c.max()) for c in columns if len(c)), default=0)
-        self.is_finished = self.frames >= self.total_frames
+        self.is_trained = self.frames >= self.total_frames  # to the end; perhaps not evaluated yet
         self.settings = _settings(config)
 
     @cached_property

@@ -109,9 +109,9 @@ def write_files(report: Report, folder: Path) -> list[Path]:
 def _unusable(run: Run, policy: str) -> str | None:
     """Returns why a run is in no table, None if it is in one."""
     unused = "only its learning curve is used"
-    if not run.is_finished:
+    if not run.is_trained:
         reached = f"{run.frames:,} of {run.total_frames:,} frames"
-        return f"{run.name} is not finished, at {reached}: {unused}"
+        return f"{run.name} is not trained to the end, at {reached}: {unused}"
     if policy not in {condition.policy for condition in run.conditions}:
         remedy = f"python -m flowrep.evaluate run={run.name} policy={policy} adds one"
         return f"{run.name} has no final {policy} evaluation: {unused}; {remedy}"

@@ -281,7 +281,7 @@ def test_reset_options_that_cannot_be_are_refused(make_street, empty_road):
         with pytest.raises((ValueError, TypeError), match=message):
             env.reset(options={option: value})
     state = env.reset(seed=0) and env.get_state()
-    with pytest.raises(ValueError, match="path.*state"):  # it would be ignored
+    with pytest.raises(ValueError, match=r"path.*state"):  # it would be ignored
         env.reset(options={"state": state, "path": "main"})
     last = (1 << 31) - 1
     assert env.reset(options={"episode_seed": np.int64(last)})[1]["episode_seed"] == last
