@@ -1,7 +1,8 @@
 """Runs a command from its command line; a mistake ends in `error:` lines and exit code 2.
 
 Hydra composes the config and `flowrep.config.schema` checks it. The errors of both are caught here;
-with `HYDRA_FULL_ERROR=1`, their traceback is printed.
+with `HYDRA_FULL_ERROR=1`, their traceback is printed. The functions that name the folders of runs
+and sweeps, which conf/run_folder.yaml calls, are at the end.
 """
 
 from __future__ import annotations
@@ -256,8 +257,8 @@ def as_typed(arguments: Sequence[str], schema: type[Command]) -> list[str]:
         is_split = value.startswith("[") and "]" not in value  # by the shell, at a space
         if is_split and not Path(value).exists():
             raise UsageError(f"'{text}' is not a list: write {key}=[a,b] or '{key}=[a, b]'")
-        is_own = text[:1] not in "-~+" and not previous.startswith("-")
-        if is_own and "run" in schema.model_fields and (text == key or Path(text).exists()):
+        is_argument = text[:1] not in "-~+" and not previous.startswith("-")
+        if is_argument and "run" in schema.model_fields and (text == key or Path(text).exists()):
             folders.append(text)
         else:
             others.append(override(key, value) if _is_folder(key, value) else text)

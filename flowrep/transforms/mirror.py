@@ -23,7 +23,7 @@ class Mirror(Transform):
     In a street whose mirror image is as likely, what holds for a left turn holds for a right turn.
     In a transition's image, the columns of the maps are reversed, at the root and under `"next"`,
     the horizontal component of flows is negated, and the action is exchanged. Reward and done flags
-    stay the same.
+    stay the same. `flowrep.envs.make_mirror` chooses all arguments for a street.
 
     | reads and writes | shape | its image |
     | --- | --- | --- |
