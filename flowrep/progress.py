@@ -23,7 +23,7 @@ def progress_bar(iterable: Any = None, *, what: str, **options: Any) -> Any:
 
     Args:
         iterable: what the bar counts, as for tqdm; None to count with `update`.
-        what: begins the plain lines; a terminal's bar begins with tqdm's `desc`, if given.
+        what: begins the plain lines, and a terminal's bar unless `desc` is given.
         options: those of tqdm.
     """
     from tqdm.asyncio import tqdm_asyncio  # here, as envs import this module and need no tqdm
@@ -34,7 +34,7 @@ def progress_bar(iterable: Any = None, *, what: str, **options: Any) -> Any:
     tqdm.set_lock(_LOCK)
     is_notebook = tqdm is not tqdm_asyncio
     if sys.stderr.isatty() or is_notebook:
-        return tqdm(iterable, **options)
+        return tqdm(iterable, **{"desc": what} | options)
     line = what + ": {n_fmt} {unit}s, {rate_fmt}{postfix}"
     if options.get("total") is not None or hasattr(iterable, "__len__"):
         line = what + ": {n_fmt} of {total_fmt} {unit}s, {rate_fmt}, {remaining} left{postfix}"

@@ -166,7 +166,7 @@ def complete(runner: Runner, stop: StopRequest) -> bool:
         if stop or not runner.evaluate("final", stop):
             return False
         print(f"wall time: {runner.clock.summary()}")
-    runner.film()
+    runner.plot_and_film()
     return True
 
 

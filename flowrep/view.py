@@ -103,7 +103,7 @@ def view(
     from flowrep.viz.plan import Track, draw_plan
 
     scene = film.street.scene
-    with progress_bar(what="driving", desc="driving", unit="frame") as bar:
+    with progress_bar(what="driving", unit="frame") as bar:
         frames, episode = film.drive(options[0], lambda _: bar.update())
     episodes = [episode, *drive_on(config, agent, options[1:])]
     tracks = [Track(each.positions.astype(float), each.outcome) for each in episodes]
@@ -119,7 +119,7 @@ def view(
         new = Path(name)
         if config.video:
             pictures = film.pictures(frames, episode)
-            pictures = progress_bar(pictures, what="drawing", desc="drawing", unit="frame")
+            pictures = progress_bar(pictures, what="drawing", unit="frame")
             write_video(new / "episode.mp4", pictures, fps=episode.fps)
         chosen = moments([moving_pixels(frame.maps) for frame in frames], config.sheet_rows)
         write_png(new / "sheet.png", contact_sheet(film.draw(frames[i]) for i in chosen))
@@ -148,8 +148,8 @@ def drive_on(
         return []
     with closing(agent.make_env(**street_of(config), num_envs=min(ENVS, len(options)))) as env:
         ended = evaluate(env, agent.policy, options)
-        counted = {"desc": "driving on", "unit": "episode", "total": len(options)}
-        episodes = list(progress_bar(ended, what="driving on", **counted))
+        counted = progress_bar(ended, what="driving on", unit="episode", total=len(options))
+        episodes = list(counted)
     return sorted(episodes, key=lambda episode: episode.episode_seed)
 
 

@@ -75,12 +75,12 @@ from flowrep import progress
 
 progress.LINE_EVERY_S = 0.1
 options = {"miniters": 0, "mininterval": 0.01}
-with progress.progress_bar(what="training", total=4_000, unit="frame", **options) as bar:
+with progress.progress_bar(what="training", desc=None, total=4_000, unit="frame", **options) as bar:
     bar.set_postfix_str("success 3%")
     for number in range(20):
         bar.update(100)
         time.sleep(0.02)
-    inner = {"desc": "evaluating", "unit": "episode", "leave": False} | options
+    inner = {"unit": "episode", "leave": False} | options
     for _ in progress.progress_bar(range(20), what="evaluating", **inner):
         time.sleep(0.02)
 for _ in progress.progress_bar(iter(range(3)), what="quick", unit="frame"):

@@ -241,14 +241,15 @@ class TrainConfig(EnvConfig):
 
     @model_validator(mode="after")
     def _learns_something(self) -> TrainConfig:
-        if self.resume is None:  # the run's own algorithm counts then
-            key, frames = self.algorithm.first_update(self.num_envs)
-            if frames > self.total_frames:
-                value = getattr(self.algorithm, key)
-                raise ValueError(
-                    f"algorithm.{key}={value}: the first update would come after {frames} frames, "
-                    f"and total_frames is {self.total_frames}: raise it, or lower algorithm.{key}"
-                )
+        if self.resume is not None:  # the config that the run stored counts instead
+            return self
+        key, frames = self.algorithm.first_update(self.num_envs)
+        if frames > self.total_frames:
+            value = getattr(self.algorithm, key)
+            raise ValueError(
+                f"algorithm.{key}={value}: the first update would come after {frames} frames, "
+                f"and total_frames is {self.total_frames}: raise it, or lower algorithm.{key}"
+            )
         least = 2 * self.num_envs  # a step of all envs, and the one before
         capacity = getattr(self.algorithm, "replay_capacity", least)
         if capacity < least:

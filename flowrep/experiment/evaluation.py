@@ -248,8 +248,8 @@ class PairedEvaluation:
             if name in self.policies:
                 group.clear()
         with progress_bar(
-            what="evaluating", desc="evaluating", total=self.total, initial=self.done,
-            unit="episode", leave=False, miniters=0, mininterval=0.5,
+            what="evaluating", total=self.total, initial=self.done, unit="episode", leave=False,
+            miniters=0, mininterval=0.5,
         ) as bar:  # fmt: skip
             # Each frame redraws the bar's clock, since the first episodes take seconds.
             for episode in self._episodes(

@@ -85,10 +85,11 @@ class Runner:
             self.observation = self.env.reset()
         if self.evaluation_pending:
             self.evaluation_pending = not self.evaluate("training", stop)
-        progress = {"total": total, "initial": self.frames, "unit": "frame", "unit_scale": True}
+        # No `desc`: the metrics at the line's end need the columns.
         with progress_bar(
-            what="training", **progress, miniters=0, mininterval=0.5, dynamic_ncols=True
-        ) as bar:
+            what="training", desc=None, total=total, initial=self.frames, unit="frame",
+            unit_scale=True, miniters=0, mininterval=0.5, dynamic_ncols=True,
+        ) as bar:  # fmt: skip
             while self.frames < total and not stop:
                 with self.clock("policy"):
                     acted = self.act()
@@ -177,7 +178,7 @@ class Runner:
             print_results([record.row() for record in records])
         return True
 
-    def film(self) -> None:
+    def plot_and_film(self) -> None:
         """Writes causes of failure and the learning curve; films an episode if none is filmed."""
         # drawing takes seconds to import
         from flowrep.experiment.film import draw_learning_curve, record_episode
