@@ -15,6 +15,7 @@ from flowrep.envs.sensing import SENSORS
 from flowrep.envs.street_env import StreetEnv, checked_frame_rate
 from flowrep.envs.vector_env import StreetVectorEnv
 from flowrep.envs.workers import WorkerVectorEnv, available_cores
+from flowrep.geometry.checks import checked_count
 from flowrep.scenes.load import load_scene
 from flowrep.scenes.scene import Range, Scene, SpeedMode, num_classes
 from flowrep.scenes.vehicle import YAW_SIGN
@@ -121,8 +122,8 @@ def make_env(
     torch.Size([2, 3, 2, 84, 84])
     >>> env.close()
     """
-    if num_envs < 1:
-        raise ValueError(f"num_envs is {num_envs}; give at least one env")
+    num_envs = checked_count("num_envs", num_envs)
+    num_workers = checked_count("num_workers", num_workers, least=0)
     device = usable_device(device)
     loaded = load_scene(scene)
     # An estimator and its pictures need one scale; that of a mapping counts.

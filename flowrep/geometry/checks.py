@@ -75,9 +75,10 @@ def check_name(option: str, name: object, names: Any) -> None:
 
 def checked_count(option: str, count: float, least: int = 1, most: int | None = None) -> int:
     """Returns a whole number as an int; raises ValueError for a fraction, or one out of range."""
-    if count % 1 != 0 or count < least or (most is not None and count > most):
+    is_whole = not isinstance(count, str) and count % 1 == 0
+    if not is_whole or count < least or (most is not None and count > most):
         limits = f"of at least {least}" if most is None else f"from {least} to {most}"
-        raise ValueError(f"{option} must be a whole number {limits}, got {count}")
+        raise ValueError(f"{option} must be a whole number {limits}, got {count!r}")
     return int(count)
 
 

@@ -52,8 +52,8 @@ class Mirror(Transform):
             doubles it; "all" replaces all.
 
     Raises:
-        ValueError: `flow_keys` holds a key that `in_keys` lacks, `swapped_actions` doesn't exchange
-            actions in pairs, K has skew, or 2·cx isn't whole.
+        ValueError: `in_keys` repeats a key, `flow_keys` holds a key that `in_keys` lacks,
+            `swapped_actions` doesn't exchange actions in pairs, K has skew, or 2·cx isn't whole.
         RuntimeError: it is used in an env.
 
     Example:
@@ -78,6 +78,8 @@ class Mirror(Transform):
         images: Images = "half",
     ) -> None:
         keys = as_keys(in_keys)
+        if len({*keys}) < len(keys):  # mirrored twice, a map would be the original
+            raise ValueError(f"in_keys names a map twice: {keys}")
         super().__init__(in_keys=keys, out_keys=keys)
         self.flow_keys = [] if flow_keys is None else as_keys(flow_keys)
         unknown = [key for key in self.flow_keys if key not in keys]

@@ -83,9 +83,15 @@ def test_marks_that_name_no_street_reset_none_and_no_marks_all(make):
         env.step(again.set("action", torch.tensor([0, 7])))
 
 
-@pytest.mark.parametrize(("num_envs", "num_workers"), [(0, 0), (2, 3), (2, -1)])
-def test_no_environments_and_too_many_workers_are_refused(num_envs, num_workers):
-    with pytest.raises(ValueError, match=r"num_\w+ is "):
+@pytest.mark.parametrize(
+    ("num_envs", "num_workers", "named"),
+    [
+        (0, 0, "num_envs"), (1.5, 0, "num_envs"), (2, 3, "num_workers"), (2, -1, "num_workers"),
+        (2, "auto", "num_workers"),  # as commands have it
+    ],
+)  # fmt: skip
+def test_no_environments_and_too_many_workers_are_refused(num_envs, num_workers, named):
+    with pytest.raises(ValueError, match=f"^{named} "):
         make_env("straight_road", num_envs=num_envs, num_workers=num_workers)
 
 

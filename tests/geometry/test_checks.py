@@ -61,6 +61,7 @@ OPTIONS = {
     "between 0 and 180 degrees": lambda: from_fov(fov_deg=180.0),
     "height must be a whole number": lambda: from_fov(height=0),
     "width must be a whole number": lambda: from_fov(width=6.5),
+    "whole number of at least 1, got '6'": lambda: from_fov(width="6"),
     "['forward', 'backward'], got 'back'": lambda: adapt_flow(direction="back"),
     "['current', 'previous'], got 'next'": lambda: adapt_flow(grid="next"),
     "['uv', 'row_column'], got 'vu'": lambda: adapt_flow(channels="vu"),

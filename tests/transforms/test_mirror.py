@@ -35,8 +35,8 @@ def transitions(*batch: int) -> TensorDict:
 
 
 def mirror(images="all", **options) -> Mirror:
-    keys = {"flow_keys": "raw", "swapped_actions": SWAPPED} | options
-    return Mirror(["raw", "seg"], images=images, **keys)
+    keys = {"in_keys": ["raw", "seg"], "flow_keys": "raw", "swapped_actions": SWAPPED}
+    return Mirror(images=images, **keys | options)
 
 
 def image(td: TensorDict) -> TensorDict:
@@ -165,6 +165,7 @@ def test_a_batch_may_lack_the_next_maps_but_not_its_own():
     ("options", "named"),
     [
         ({"flow_keys": "ego"}, "ego"),
+        ({"in_keys": ["raw", "raw"]}, "twice.*raw"),
         ({"swapped_actions": [1, 2, 0]}, "swapped_actions"),
         ({"images": "some"}, "images"),
         ({"intrinsics": camera(2.6)}, "cx"),
