@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from PIL import Image as pillow
+from PIL import ImageDraw
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Categorical
@@ -279,9 +281,6 @@ def steering(turned: float, sign: float = 0.0, background: Image | None = None) 
         sign: of the chosen action, positive to the left; 0 draws no arrow.
         background: an image of the same size to draw on; grey if None.
     """
-    from PIL import Image as pillow
-    from PIL import ImageDraw
-
     if background is None:
         background = np.full((_WHEEL_PX, 2 * _WHEEL_PX, 3), 90, np.uint8)
     fine = 4  # drawn larger and scaled down, as Pillow draws without antialiasing

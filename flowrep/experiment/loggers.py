@@ -34,6 +34,7 @@ class Loggers:
             self._tensorboard = None
         with naming(events):
             if self._tensorboard is None:
+                # Imports PyTorch, before which commands open their folders.
                 from torchrl.record.loggers import TensorboardLogger
 
                 self._tensorboard = TensorboardLogger(events.name, str(self._folder))

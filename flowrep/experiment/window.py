@@ -73,7 +73,7 @@ def drive_by_hand(
     The last frame of an episode stays in view until R begins the next one, with the next seed.
     `pause` draws and handles keys for some seconds; by default, it is Matplotlib's.
     """
-    import matplotlib.pyplot as plt
+    import matplotlib.pyplot as plt  # looks for a screen, which other views don't need
 
     # Disable Matplotlib's own shortcuts for the driver's keys (left: back, r: home, q: quit).
     shortcuts: Any = {name: [] for name in plt.rcParams if name.startswith("keymap.")}
