@@ -155,20 +155,21 @@ class RunFolder:
         return self.path / "videos" / f"{name}.mp4"
 
     def begin(self, config: TrainConfig, overrides: Iterable[str]) -> TrainConfig:
-        """Writes the config of a new run, in which `precision=auto` is resolved, and returns it."""
+        """Writes a new run's config and overrides; returns the config, with resolved precision."""
         from flowrep.experiment import build
 
         self.check_is_new()
         config = build.with_precision(config)
-        self.write_config(config.plain(), overrides)
-        return config
-
-    def write_config(self, config: Mapping[str, Any], overrides: Iterable[str] = ()) -> None:
-        """Writes the resolved config, and the overrides where Hydra keeps them."""
         self._prepare()
-        (self.path / ".hydra").mkdir(exist_ok=True)
+        (self.path / ".hydra").mkdir(exist_ok=True)  # where Hydra keeps the overrides
         typed = yaml.safe_dump(list(overrides), allow_unicode=True)
         replace_text(self.path / ".hydra" / "overrides.yaml", typed)
+        self.write_config(config.plain())
+        return config
+
+    def write_config(self, config: Mapping[str, Any]) -> None:
+        """Writes the resolved config."""
+        self._prepare()
         replace_text(self.config_path, yaml.safe_dump(dict(config), sort_keys=False))
 
     def read_config(self) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from flowrep.experiment.lock import FolderInUseError, RunFolderError
 from flowrep.experiment.outcomes import EVALUATION_COLUMNS, EpisodeRecord
 from flowrep.experiment.run import RunFolder, machine_of, origin_of
 from flowrep.tables import TableError, write_rows
-from tests.config.composing import plain
+from tests.config.composing import composed, plain
 
 
 def hold(run, is_held):
@@ -337,7 +337,9 @@ def test_only_what_was_written_before_the_first_checkpoint_is_dropped_without_on
 
 def test_config_comes_back_as_written(tmp_path):
     run = RunFolder(tmp_path)
-    run.write_config(CONFIG, ["seed=3"])
+    config = run.begin(composed("seed=3", "debug=smoke"), ["seed=3"])
+    assert RunFolder.existing(tmp_path).config() == config
+    run.write_config(CONFIG)  # as for a run that is made longer
     assert RunFolder.existing(tmp_path).read_config() == CONFIG
     assert (tmp_path / ".hydra" / "overrides.yaml").read_text() == "- seed=3\n"
 
