@@ -112,8 +112,11 @@ def _unusable(run: Run, policy: str) -> str | None:
     if not run.is_trained:
         reached = f"{run.frames:,} of {run.total_frames:,} frames"
         return f"{run.name} is not trained to the end, at {reached}: {unused}"
-    if policy not in {condition.policy for condition in run.conditions}:
+    driven = {condition.policy for condition in run.conditions}
+    if policy not in driven:
         remedy = f"python -m flowrep.evaluate run={run.name} policy={policy} adds one"
+        for other in driven & {"greedy", "sampled"}:
+            remedy += f"; a report with policy={other} has the one that there is"
         return f"{run.name} has no final {policy} evaluation: {unused}; {remedy}"
     return None
 

@@ -2,6 +2,7 @@
 
 import csv
 import math
+import re
 from functools import partial
 
 import pytest
@@ -194,6 +195,14 @@ def test_an_unfinished_run_is_in_the_learning_curve_alone(tmp_path):
     assert list(found) == ["learning_curves"]
     (warning,) = report.warnings
     assert all(part in warning for part in ("half", "400", "1,000"))
+
+
+def test_a_run_without_greedy_episodes_says_which_report_has_its_sampled_ones(tmp_path):
+    config = config_of()
+    rows = rows_of(config, "sc", policy="sampled") + rows_of(config, "cc", policy="random")
+    write_run(tmp_path / "drawn", config, rows)
+    (warning,) = sections_of(tmp_path)[1].warnings
+    assert re.findall(r"policy=(\w+)", warning) == ["greedy", "sampled"]
 
 
 def test_a_learning_curve_is_of_the_speed_and_frame_rate_of_training(tmp_path):
