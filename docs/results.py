@@ -49,7 +49,7 @@ from flowrep.report.runs import (
     grid_of,
     in_order,
     in_stacks,
-    own_scores,
+    scores_of,
     success_rate,
 )
 from flowrep.report.statistics import LEVEL, Array, Effect, Estimate, mean_share
@@ -339,7 +339,7 @@ def failure_table(papers: Mapping[str, float], runs: Sequence[Run]) -> str:
     for stack in (stack for stack in papers if stack in here):
         members, shares = here[stack], []
         for speeds in (("low", "high"), ("normal",)):
-            of_runs = own_scores(members, conditions_of(members[0], speeds), departures)
+            of_runs = scores_of(members, conditions_of(members[0], speeds), departures)
             shares.append(percent(mean_share([of_runs])) if len(of_runs) else "")
         rows.append((_stack(stack), f"{papers[stack]:.1f}", *shares, str(len(members))))
     return _table(("", "the paper", "low and high", "training", "runs"), rows)

@@ -95,7 +95,7 @@ def open_flow_source(config: FactorizeConfig, stream: sequences.Stream) -> FlowS
             why = stream.no_flow if isinstance(stream, sequences.Recording) else "a video has none"
             raise UsageError(f"flow=exact: {config.input} has no flow of its own; {why}")
         return sequences.recorded_flow
-    # Here, since TorchRL's import takes as long as all others: a mistake is told before.
+    # TorchRL takes as long to import as all others together, so mistakes above are reported first.
     from flowrep.transforms import EstimatedFlow
 
     estimator = EstimatedFlow(**options).estimator

@@ -187,7 +187,7 @@ def departures(outcomes: Sequence[NDArray[Any]]) -> float:
     return float(out / (out + hit)) if out + hit else float("nan")
 
 
-def own_scores(
+def scores_of(
     runs: Iterable[Run], conditions: Sequence[Condition], score: Score = success_rate
 ) -> Array:
     """Returns the score of each run `[R]` over all of its episodes, sorted by seed.
@@ -270,7 +270,7 @@ def cell_of(runs: Sequence[Run], condition: Condition) -> Cell | None:
     driven = [number for number in lengths if number]
     if not driven:
         return None
-    rates, fewest, most = own_scores(runs, [condition]), min(driven), max(driven)
+    rates, fewest, most = scores_of(runs, [condition]), min(driven), max(driven)
     counts = f"{len(rates)} × {fewest}" + (f"–{most}" if most > fewest else "")
     return Cell(rates, counts, mean_share([rates], fewest))
 

@@ -26,9 +26,9 @@ from flowrep.report.runs import (
     groups_of,
     in_order,
     in_stacks,
-    own_scores,
     paired_scores,
     scenes_of,
+    scores_of,
 )
 from flowrep.report.statistics import Estimate, effect, holm, improvement, mean_share
 from flowrep.report.tables import MISSING, Table, listed, p_text, percent, points, ratio
@@ -280,7 +280,7 @@ def _failure_cells(runs: Sequence[Run], conditions: Sequence[Condition]) -> tupl
     ends = Counter(str(end) for r in ours for c in conditions for end in r.under(c)["outcome"])
     failures = ends["out_of_bounds"] + ends["collision"]
     counted = (str(failures), str(ends["timeout"]), str(ends.total()))
-    shares = own_scores(ours, conditions, departures)
+    shares = scores_of(ours, conditions, departures)
     if not len(shares):
         return (*["no failures"] * 3, *counted)
     share = mean_share([shares], failures // len(shares))
