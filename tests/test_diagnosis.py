@@ -22,7 +22,7 @@ from flowrep import diagnose, geometry
 from flowrep.diagnosis import Examination
 from flowrep.geometry.pose import rotation_from_vector
 from tests.injected import matrix, mistakes
-from tests.injected.sources import ENVS, RECORDINGS, realsense, room, street
+from tests.injected.sources import ENVS, RECORDINGS, crowd, realsense, room, street
 
 
 def only(source, mistake):
@@ -44,6 +44,39 @@ def test_noise_holes_and_movers_are_no_mistake(seed):
     assert found.is_right, found
     # The poses' own noise is of a millimetre and 0.04 degrees: some 0.2 px in all.
     assert 0.05 < found.error_px < 0.4
+
+
+@pytest.mark.slow_after_first
+@pytest.mark.parametrize(
+    ("seed", "people", "noise_px", "is_common", "share"),
+    [
+        (0, 4, 0.15, False, 0.53), (5, 4, 0.15, True, 0.57), (0, 4, 0.0, False, 0.53),
+        (4, 4, 0.15, True, 0.50), (0, 6, 0.3, False, 0.60), (1, 6, 0.15, True, 0.61),
+    ],
+)  # fmt: skip
+def test_a_crowd_that_another_motion_fits_better_is_no_mistake(
+    seed, people, noise_px, is_common, share
+):
+    taken = crowd(seed, people, noise_px, is_common)
+    assert (taken.ids > 0).mean() == pytest.approx(share, abs=0.005)
+    found = matrix.of_recording(taken)
+    assert found.is_right, found
+    assert any("move" in note for note in found.notes)
+
+
+@pytest.mark.slow_after_first
+@pytest.mark.parametrize(
+    ("mistake", "seed", "is_common"),
+    [
+        ("poses world-to-camera", 0, False), ("poses a frame late", 0, False),
+        ("depth 10 cm off", 2, False), ("mirrored world", 4, True),
+        ("poses' yaw times 1.2", 4, True),
+    ],
+)  # fmt: skip
+def test_mistakes_are_noticed_beside_a_crowd(mistake, seed, is_common):
+    spoilt = {name: change for name, (change, _) in mistakes.LISTED.items()} | mistakes.UNLISTED
+    found = matrix.of_recording(spoilt[mistake](crowd(seed, is_common=is_common)))
+    assert found.is_wrong, found
 
 
 @pytest.mark.slow_after_first
@@ -190,12 +223,26 @@ def test_poses_that_are_a_little_off_in_a_third_of_the_pairs_are_noticed():
 
 
 def test_pixels_that_do_not_fit_are_told_with_their_share():
-    depth = room(3).depth
-    wraps = depth > 3.0
-    found = matrix.of_recording(room(3).with_(depth=depth % 3.0, rgb=None))
-    assert 0.1 < wraps.mean() < 0.4
+    depth, wrong = room(3).depth.copy(), np.zeros(room(3).depth.shape, bool)
+    wrong[:, 20:60, 30:90] = True  # an eighth of the picture, as far again
+    found = matrix.of_recording(room(3).with_(depth=np.where(wrong, 2 * depth, depth), rgb=None))
     (note,) = [note for note in found.notes if "don't fit" in note]
-    assert abs(float(note.split("%")[0]) / 100 - wraps.mean()) < 0.05
+    assert abs(float(note.split("%")[0]) / 100 - wrong.mean()) < 0.03
+
+
+@pytest.mark.parametrize(("source", "seed"), [(room, 0), (realsense, 0), (street, 0), (room, 3)])
+def test_depth_that_wraps_around_in_a_part_of_the_picture_is_named(source, seed):
+    taken = source(seed).with_(rgb=None)
+    known = taken.depth[np.isfinite(taken.depth)]
+    for share, is_many in ((0.05, False), (0.2, True)):
+        most = float(f"{np.quantile(known, 1 - share):.3g}")
+        wraps = np.where(np.isinf(taken.depth), np.inf, taken.depth % most)
+        found = matrix.of_recording(taken.with_(depth=wraps))
+        assert found.is_wrong == is_many
+        (said,) = [text for text in (found.words, *found.notes) if "wraps around" in text]
+        assert abs(float(said.split("%")[0]) / 100 - share) < 0.03
+        assert float(said.split(" m are")[0].split()[-1]) == pytest.approx(most, rel=0.02)
+    assert not any("wraps" in note for note in matrix.of_recording(taken).notes)
 
 
 def test_an_identity_among_the_poses_is_named_by_its_frame_and_does_not_decide():
@@ -301,6 +348,17 @@ def test_a_body_whose_motion_alone_is_wrong_is_named(frames):
     found = spoilt(frames, instance_motion=lambda rows: torch.cat(
         [rows[:, :2], rows[:, :1]], 1))  # fmt: skip
     assert "body 2:" in found.words
+
+
+def test_ids_without_motions_of_bodies_say_what_is_the_static_world():
+    taken = room(3, movers=2)
+    td, K = matrix.tensordict_of(taken)
+    td["raw"] = torch.from_numpy(taken.flow).float()  # measured, with the bodies' motions
+    del td["sensor", "instance_motion"]
+    found = diagnose(td, K)
+    assert found.is_right, found
+    assert any("bodies are not tested" in note for note in found.notes)
+    assert not any("don't fit" in note for note in found.notes)
 
 
 def test_ids_that_are_no_bodys_are_not_called_right(frames):

@@ -29,6 +29,7 @@ from flowrep.diagnosis.verdict import Diagnosis, diagnosed, is_better
 _PAIRS = 8
 _BODIES, _MOVED_PX, _FEW_PIXELS = 24, 0.25, 32  # in pairs of frames, that show
 _FEW_FRAMES = 3  # of a body
+_MUCH = 0.2  # of the picture: id 0 is then the static world, if no motions tell
 _ROUND = 0.05  # of a body's flow: depth between pixels is less exact where bodies are round
 _SAME_PX, _SAME_SHARE = 0.02, 0.01  # of flow that was computed twice
 
@@ -153,11 +154,15 @@ class _Seen:
         self.ids, self.ids_before = (x.get("instance", nobody).long() for x in both)
         poses = [x.get("world_from_cam", None) for x in both[::-1]]
         self.poses = None if poses[0] is None else [pose.double() for pose in poses]
-        self.rows = both[0].get("instance_motion", self.motion.unsqueeze(1)).double()
+        rows, self.has_rows = self.motion.unsqueeze(1), "instance_motion" in both[0].keys()
+        self.rows = both[0]["instance_motion"].double() if self.has_rows else rows
         rows = self.ids.clamp(0, self.rows.shape[1] - 1)
         # Many simulators number what stands still, too.
         stands = (self.rows - self.rows[:, :1]).abs().flatten(2).amax(-1) < 1e-6
         self.is_static = stands.gather(1, rows.flatten(1)).view_as(rows)
+        is_world = (self.ids == 0) & self.depth.isfinite()
+        if not self.has_rows and is_world.double().mean() > _MUCH:
+            self.is_static = self.ids == 0
         self.flow = geometry.rigid_flow(self.depth, rows, self.K, self.rows, prev_K=self.prev_K)
         self.ego = self.flow_of(self.motion)
         self.raw, self.is_derived = now.get(raw_key, None), True
@@ -211,6 +216,9 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[list[str], list[str], list[
     the frame before, on the body's pixels, and by what the best motion would leave there.
     """
     count, ids = seen.rows.shape[1], seen.ids[:, 0]
+    unseen = ["no moving body is seen: ids and motions of bodies are not tested"]
+    if not seen.has_rows:
+        return [], unseen, []
     if int(ids.min()) < 0 or int(ids.max()) >= count:
         given = f"{int(ids.min())} to {int(ids.max())}"
         return [f"instance has ids {given}, but instance_motion rows 0 to {count - 1}"], [], []
@@ -222,7 +230,6 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[list[str], list[str], list[
     known = torch.where(seen.depth[:, 0].isfinite() & (ids > 0), ids, 0)
     sizes = functional.one_hot(known.flatten(1), count).sum(1)
     body, frame = (sizes.T[1:] >= _FEW_PIXELS).nonzero().T
-    unseen = ["no moving body is seen: ids and motions of bodies are not tested"]
     if not len(body):
         return [], unseen, []
     chosen = _spread(len(frame), _BODIES)

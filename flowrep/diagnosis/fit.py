@@ -20,6 +20,8 @@ _BEHIND_PX = 1e3  # left of a point that a motion puts behind the camera
 _STEP = 1e-6  # of numeric derivatives
 # Depth between pixels is exact on planes alone: round bodies leave 0.02 px of right data.
 INTERPOLATED_PX = 0.04
+PARTS = 6, 4  # columns and rows of a picture, in which noise evens out and bodies don't
+_DEARER = 5.0  # a pixel that agrees no longer counts as this many that begin to
 _SETTLED = 0.01  # a step that is too small to matter, in scales of all pixels' root of squares
 
 
@@ -182,6 +184,13 @@ def px_of(left: Tensor, share: float | None = None) -> Tensor:
     return left.square().sum(-2).sqrt().nanquantile(share, -1, interpolation="lower")
 
 
+def spread_of(left: Tensor) -> Tensor:
+    """Returns the median of what is left as noise alone would make it, by its lower third."""
+    if left.shape[-2] == 1:
+        return px_of(left)
+    return math.sqrt(math.log(2) / math.log(1.5)) * px_of(left, 1 / 3)
+
+
 def apart(pairs: Pairs, one: Tensor, other: Tensor) -> Tensor:
     """Returns the difference between what two motions leave, which has no noise, px `[P]`."""
     left = residual(pairs, one, plain=True) - residual(pairs, other, plain=True)
@@ -282,20 +291,39 @@ def best_motion(pairs: Pairs, *starts: Tensor, steps: int = 5) -> Tensor:
         for each in rounds:
             end, _ = descended(each, end, lambda p, n: p, nothing, nobody, steps=steps)
         motions.append(end)
-    return least_costly(rounds[-1], torch.stack(motions))
+    return least_costly(pairs._replace(scale_px=rounds[-1].scale_px), torch.stack(motions))
 
 
-def least_costly(few: Pairs, motions: Tensor) -> Tensor:
-    """Returns that of motions `[M, P, 4, 4]` with which most pixels of each pair agree."""
-    agree = agreement(few, motions)
-    return motions[agree.argmax(0), torch.arange(agree.shape[1])]
+def least_costly(pairs: Pairs, motions: Tensor) -> Tensor:
+    """Returns that of motions `[M, P, 4, 4]` that leaves least of each pair, the first if in doubt.
+
+    Where much of the picture moves, another motion may fit more pixels than the right one. It gives
+    up those that the right one fits, in whole parts of the picture. What corrects a wrong motion
+    gives up next to none: noise evens out over a part. Depth is compared where nothing moves.
+    """
+    if pairs.by_flow:
+        agree, (column, row) = agreement(pairs, motions), parts(pairs, *PARTS)
+        gained = torch.zeros(*agree.shape[:2], math.prod(PARTS), dtype=torch.float64)
+        gained.scatter_add_(-1, (column + PARTS[0] * row).expand_as(agree), agree - agree[0])
+        score = (gained - _DEARER * (-gained).clamp(min=0)).sum(-1)
+    else:
+        score = agreement(pairs.of(pixels=slice(FITTED)), motions).mean(-1)
+    return motions[score.argmax(0), torch.arange(score.shape[1])]
 
 
 def agreement(pairs: Pairs, motions: Tensor) -> Tensor:
-    """Returns the share `[M, P]` of each pair's pixels that agree with motions `[M, P, 4, 4]`."""
+    """Returns how much pixels agree with motions `[M, P, 4, 4]`, 0 to 1, `[M, P, N]`."""
     squared = residual(pairs, motions).square().sum(-2)
     scale = torch.stack([scale_of(each, pairs) for each in squared]).amin(0).square().unsqueeze(-1)
-    agree = (1 / (1 + squared / scale)).nan_to_num(0.0).mean(-1)
+    agree = (1 / (1 + squared / scale)).nan_to_num(0.0)
     if not pairs.by_flow:  # no interpolated edge is a reason to leave the first
         agree[0] += 0.02
     return agree
+
+
+def parts(pairs: Pairs, across: int, down: int) -> tuple[Tensor, Tensor]:
+    """Returns the column and the row `[P, N]` of the part of the picture that pixels are in."""
+    height, width = pairs.now.shape[-2:]
+    part = pairs.pixel.nan_to_num() / torch.tensor([[width / across], [height / down]])
+    column, row = part.long().unbind(1)
+    return column.clamp(0, across - 1), row.clamp(0, down - 1)

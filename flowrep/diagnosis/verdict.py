@@ -21,6 +21,7 @@ from flowrep.diagnosis.fit import (
     median,
     px_of,
     residual,
+    spread_of,
 )
 from flowrep.diagnosis.rivals import Rival
 
@@ -40,6 +41,9 @@ _DOUBTFUL, _DOUBTFUL_PX = 0.15, 0.15  # left by the best motion: the flow's esti
 # this share of all pairs they are a mistake in a part of the recording.
 _STRAY, _STRAY_SHARE, _MANY_STRAYS = 4.0, 0.04, 0.2
 _OFF, _OFF_PX, _OFF_SHARE = 3.0, 0.1, 0.03  # pixels that don't fit: in scales, and their share
+# Pixels that fit if the largest depth is added: a share that is named, one that is a mistake, and
+# how many edges between near and far a pixel has then.
+_WRAPPED_SHARE, _MANY_WRAPPED, _WRAPPED_EDGES = 0.02, 0.1, 5e-4
 _FARTHEST = 0.03  # a share of pixels at exactly the largest depth that means something
 _LARGEST_FACTORS = {"camera": 30.0, "depth": 1e5}
 
@@ -164,15 +168,21 @@ def diagnosed(
             why = f"{size} are left, by rough poses or a mistake that {len(errors)} pairs hide"
         return Diagnosis("can't tell", why, **numbers)
     notes = [f"{steps} smaller errors"] if pairs.is_coarse else []
-    known = pairs.now[pairs.now > 0].reciprocal()
-    share = float((known == known.amax()).double().mean()) if len(known) else 0.0
+    inverse = pairs.now[pairs.now > 0]
+    farthest = float(inverse.amin().reciprocal()) if len(inverse) else 0.0
+    share = float((inverse == inverse.amin()).double().mean()) if len(inverse) else 0.0
     if share > _FARTHEST:
-        notes.append(f"{share:.0%} of depth is {known.amax():.4g} m: if that is no surface, say so")
-    squared = residual(pairs, motion).square().sum(-2)
-    off = squared.sqrt() > (_OFF * fit.scale_of(squared, pairs)).clamp(min=_OFF_PX).unsqueeze(-1)
-    share = float(off.sum() / squared.isfinite().sum())
-    if pairs.by_flow and share > _OFF_SHARE:
-        notes.append(f"{share:.0%} of the pixels don't fit: they move, or depth is wrong there")
+        notes.append(f"{share:.0%} of depth is {farthest:.4g} m: if that is no surface, say so")
+    if pairs.by_flow:
+        off_share, wrapped_share = _off(pairs, motion, farthest)
+        if wrapped_share > _WRAPPED_SHARE:
+            why = f"{wrapped_share:.0%} of the pixels fit if {farthest:.5g} m are added to depth"
+            why += ": it wraps around there, as 16 bits of millimetres do at 65.536 m"
+            if wrapped_share > _MANY_WRAPPED:
+                return Diagnosis("something is wrong", why, **numbers)
+            notes.append(why)
+        if off_share > _OFF_SHARE:
+            notes.append(f"{off_share:.0%} of pixels don't fit: they move, or depth is wrong there")
     if stray:
         notes.append(f"poses that don't fit the others: {', '.join(stray)}")
     if not pairs.has_poses:
@@ -228,7 +238,7 @@ class _Fit:
 
         Blocks, since neighbouring pixels err alike.
         """
-        pairs, is_even = self.pairs, _blocks(self.pairs, 6, 4)
+        pairs, is_even = self.pairs, _every_other(self.pairs, *fit.PARTS)
         halves = [
             pairs._replace(depth=pairs.depth.masked_fill(half, math.nan))
             for half in (is_even, ~is_even)
@@ -244,10 +254,11 @@ class _Fit:
         if not self.pairs.has_poses:
             return self.error
         known, others = self.halves
-        better = torch.stack([
-            fit.agreement(half, torch.stack([self.pairs.motion, motion])).diff(dim=0)[0] > 0
+        agree = [
+            fit.agreement(half, torch.stack([self.pairs.motion, motion])).mean(-1)
             for half, motion in zip(known, others[::-1])
-        ])  # fmt: skip
+        ]
+        better = torch.stack([now < then for now, then in agree])
         count = better.numel()
         by_no_chance = 2 * int(better.sum()) - count > 2 * count**0.5
         return torch.where(better.all(0) | by_no_chance, self.error, 0.0)
@@ -286,7 +297,7 @@ def _explanations(
     if has_poses:
         known = [r.change(pairs, none).motion for r in rivals if r.of == "poses" and not r.start[0]]
         known = [pairs.motion, *known]
-        starts = [pairs.motion, fit.least_costly(few, torch.stack(known)), *starts]
+        starts = [pairs.motion, fit.least_costly(pairs, torch.stack(known)), *starts]
 
     recorded, others = fitted(pairs, best_motion(pairs, *starts, steps=8), has_poses), []
     if has_poses and recorded.left < (_EXACT_PX if pairs.by_flow else INTERPOLATED_PX):
@@ -320,7 +331,7 @@ def fitted(
         error = torch.zeros_like(error)
     rival = rival or Rival("poses", "", "", lambda pairs, n: pairs)
     n = none if n is None else n
-    spread = px_of(residual(pairs, motion))
+    spread = spread_of(residual(pairs, motion))
     return _Fit(rival, n.nanmedian(0).values, pairs, motion, error, spread)
 
 
@@ -392,6 +403,26 @@ def _other_times(recorded: _Fit, raw_px: float) -> str:
     return f"depth moves otherwise than flow, by {px:.2g} px of {raw_px:.2g} px: is it of one time?"
 
 
+def _off(pairs: Pairs, motion: Tensor, farthest: float) -> tuple[float, float]:
+    """Returns the share of pixels that don't fit, and of those whose depth has wrapped around.
+
+    These fit if the largest depth is added to theirs, and the nearest pixels border on the
+    farthest. Moving pixels may fit by chance, but have no such edges.
+    """
+    left, farther = (
+        residual(each, motion).square().sum(-2)
+        for each in (pairs, pairs._replace(depth=pairs.depth + farthest))
+    )
+    most = (_OFF * fit.scale_of(left, pairs)).clamp(min=_OFF_PX).square().unsqueeze(-1)
+    off, number = left > most, left.isfinite().sum()
+    side = pairs.now.reciprocal() / farthest
+    side = ((side > 0.9) & (side <= 1)).long() - ((side > 0) & (side < 0.1)).long()
+    edges = sum(int((side.diff(dim=dim).abs() == 2).sum()) for dim in (1, 2))
+    wraps = edges > _WRAPPED_EDGES * side.numel()
+    wrapped = off & (farther < most) & wraps
+    return float(off.sum() / number), float(wrapped.sum() / number)
+
+
 def _unseen(pairs: Pairs, rivals: Sequence[Rival], least: float) -> tuple[str, ...]:
     """Returns what mends the mistakes of a usual size that change nothing here."""
     pairs, unseen = pairs.of(pixels=slice(fit.FITTED)), []
@@ -404,11 +435,10 @@ def _unseen(pairs: Pairs, rivals: Sequence[Rival], least: float) -> tuple[str, .
     return tuple(unseen)
 
 
-def _blocks(pairs: Pairs, across: int, down: int) -> Tensor:
-    """Returns which pixels `[P, N]` are in every other block of the picture."""
-    height, width = pairs.now.shape[-2:]
-    block = pairs.pixel.nan_to_num() / torch.tensor([[width / across], [height / down]])
-    return block.floor().sum(1) % 2 == 0
+def _every_other(pairs: Pairs, across: int, down: int) -> Tensor:
+    """Returns which pixels `[P, N]` are in every other part of the picture, as on a chessboard."""
+    column, row = fit.parts(pairs, across, down)
+    return (column + row) % 2 == 0
 
 
 def _mapped(pairs: Pairs, best: Tensor) -> Tensor:
@@ -445,7 +475,7 @@ def _smoothed(pairs: Pairs, best: Tensor) -> Tensor:
     q = (q / q.median(-1, keepdim=True).values.clamp(min=1e-9)).clamp(max=3.0) - 1
     powers = [(a, b, c) for a in range(4) for b in range(4 - a) for c in range(3)]
     terms = torch.stack([x**a * y**b * q**c for a, b, c in powers], -1)
-    is_even, out = _blocks(pairs, 5, 4), left
+    is_even, out = _every_other(pairs, 5, 4), left
     for half in (is_even, ~is_even):
         known = half & left.isfinite().all(1)
         weight = known.double()
@@ -458,4 +488,4 @@ def _smoothed(pairs: Pairs, best: Tensor) -> Tensor:
             scale = fit.scale_of(squared, pairs).square().unsqueeze(-1)
             weight = (1 + squared / scale).square().reciprocal().nan_to_num()
         out = torch.where(half.unsqueeze(1), out, rest)
-    return px_of(out)
+    return spread_of(out)

@@ -136,31 +136,60 @@ def painted(points: Array, seed: int) -> Array:
 @cache
 def room(seed: int = 0, frames: int = 16, movers: int = 0) -> Shots:
     """Returns a room with exact depth, poses and flow, and textured pictures."""
-    times, random = np.arange(frames), np.random.default_rng(seed + 1)
-    poses = hand_held(seed, times)
-    middle, ahead = poses[frames // 2, :3, 3], poses[frames // 2, :3, 2]
-    places, moved = [], np.tile(np.eye(4), (frames, 1 + movers, 1, 1))
+    random, poses = np.random.default_rng(seed + 1), hand_held(seed, np.arange(frames))
+    middle, ahead, bodies = poses[frames // 2, :3, 3], poses[frames // 2, :3, 2], []
     for i in range(movers):
         side = np.cross(ahead, [0, 0, 1.0]) * (0.7 if i % 2 else -0.6)
         step = random.uniform(-0.06, 0.06, 3) * [1, 1, 0.3]
-        places.append(middle + 1.7 * ahead + side + (times[:, None] - frames / 2) * step)
+        bodies.append((middle + 1.7 * ahead + side, step, np.array(MOVERS[i])))
+    return filmed(seed, poses, bodies)
+
+
+@cache
+def crowd(
+    seed: int = 0, people: int = 4, noise_px: float = 0.15, is_common: bool = False,
+    frames: int = 16, speed: float = 0.4,
+) -> Shots:  # fmt: skip
+    """Returns a room with people who walk, by default on 43 % of the picture; noise of flow.
+
+    Args:
+        is_common: all walk alike; else each in a direction.
+        speed: the camera's, 1 is that in `room`.
+    """
+    random, poses = np.random.default_rng(seed + 50), hand_held(seed, speed * np.arange(frames))
+    middle, ahead, bodies = poses[frames // 2, :3, 3], poses[frames // 2, :3, 2], []
+    side, walk = np.cross(ahead, [0, 0, 1.0]), random.uniform(0, 2 * np.pi)
+    for i in range(people):
+        across = 2.4 * (i + random.uniform(0.2, 0.8)) / people - 1.2
+        place = middle + random.uniform(1.6, 2.2) * ahead + across * side
+        angle = walk if is_common else random.uniform(0, 2 * np.pi)
+        step = random.uniform(0.03, 0.05) * np.array([np.cos(angle), np.sin(angle), 0])
+        bodies.append((np.array([*place[:2], 0.85]), step, np.array([0.15, 0.15, 0.85])))
+    shots = filmed(seed, poses, bodies)
+    return shots.with_(flow=shots.flow + noise_px * random.normal(size=shots.flow.shape), rgb=None,
+                       late=hand_held(seed, speed * np.arange(frames) - 0.4))  # fmt: skip
+
+
+def filmed(seed: int, poses: Array, bodies: list[tuple[Array, Array, Array]]) -> Shots:
+    """Returns the room with bodies: place in the middle of the film, step a frame, half sides."""
+    frames, (u, v) = len(poses), centres(*SIZE)
+    moved = np.tile(np.eye(4), (frames, 1 + len(bodies), 1, 1))
+    for i, (_, step, _) in enumerate(bodies):
         moved[1:, i + 1, :3, 3] = -step
     maps: dict[str, list[Array]] = {name: [] for name in ("depth", "rgb", "flow", "ids")}
-    u, v = centres(*SIZE)
     for t, pose in enumerate(poses):
-        bodies = [(places[i][t], np.array(MOVERS[i])) for i in range(movers)]
-        z, ids, points = cast(pose, bodies)
+        places = [place + (t - frames / 2) * step for place, step, _ in bodies]
+        z, ids, points = cast(pose, [(p, half) for p, (_, _, half) in zip(places, bodies)])
         before = points + moved[t, ids.ravel(), :3, 3]
         back = poses[max(t - 1, 0)]
         seen = projected(back[:3, :3].T @ (before - back[:3, 3]).T, K, SIZE)
         maps["flow"].append(np.stack([u, v]) - seen if t else np.full((2, *SIZE), np.nan))
-        centre = sum((ids.ravel() == i + 1)[:, None] * places[i][t] for i in range(movers))
-        on_body = points - centre
+        on_body = points - np.array([np.zeros(3), *places])[ids.ravel()]
         maps["rgb"].append(painted(on_body, seed).reshape(*SIZE, 3))
         maps["depth"].append(z)
         maps["ids"].append(ids)
     depth, rgb, flow, ids = (np.array(maps[name]) for name in ("depth", "rgb", "flow", "ids"))
-    late = hand_held(seed, times - 0.4)
+    late = hand_held(seed, np.arange(frames) - 0.4)
     return Shots(depth, poses, np.tile(K, (frames, 1, 1)), rgb, flow, ids, moved, late)
 
 
