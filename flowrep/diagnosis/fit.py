@@ -291,24 +291,27 @@ def best_motion(pairs: Pairs, *starts: Tensor, steps: int = 5) -> Tensor:
         for each in rounds:
             end, _ = descended(each, end, lambda p, n: p, nothing, nobody, steps=steps)
         motions.append(end)
-    return least_costly(pairs._replace(scale_px=rounds[-1].scale_px), torch.stack(motions))
+    return least_costly(rounds[-1], torch.stack(motions))
 
 
-def least_costly(pairs: Pairs, motions: Tensor) -> Tensor:
-    """Returns that of motions `[M, P, 4, 4]` that leaves least of each pair, the first if in doubt.
+def least_costly(few: Pairs, motions: Tensor) -> Tensor:
+    """Returns that of motions `[M, P, 4, 4]` with which most pixels of each pair agree."""
+    agree = agreement(few, motions).mean(-1)
+    return motions[agree.argmax(0), torch.arange(agree.shape[1])]
+
+
+def fits_a_crowd(pairs: Pairs, motion: Tensor) -> Tensor:
+    """Returns in which pairs a motion gives up pixels that the recorded one fits, `[P]`.
 
     Where much of the picture moves, another motion may fit more pixels than the right one. It gives
     up those that the right one fits, in whole parts of the picture. What corrects a wrong motion
-    gives up next to none: noise evens out over a part. Depth is compared where nothing moves.
+    gives up next to none: noise evens out over a part.
     """
-    if pairs.by_flow:
-        agree, (column, row) = agreement(pairs, motions), parts(pairs, *PARTS)
-        gained = torch.zeros(*agree.shape[:2], math.prod(PARTS), dtype=torch.float64)
-        gained.scatter_add_(-1, (column + PARTS[0] * row).expand_as(agree), agree - agree[0])
-        score = (gained - _DEARER * (-gained).clamp(min=0)).sum(-1)
-    else:
-        score = agreement(pairs.of(pixels=slice(FITTED)), motions).mean(-1)
-    return motions[score.argmax(0), torch.arange(score.shape[1])]
+    agree = agreement(pairs, torch.stack([pairs.motion, motion]))
+    column, row = parts(pairs, *PARTS)
+    gained = torch.zeros(agree.shape[1], math.prod(PARTS), dtype=torch.float64)
+    gained.scatter_add_(-1, column + PARTS[0] * row, agree[1] - agree[0])
+    return (gained - _DEARER * (-gained).clamp(min=0)).sum(-1) < 0
 
 
 def agreement(pairs: Pairs, motions: Tensor) -> Tensor:

@@ -44,6 +44,8 @@ _OFF, _OFF_PX, _OFF_SHARE = 3.0, 0.1, 0.03  # pixels that don't fit: in scales, 
 # Pixels that fit if the largest depth is added: a share that is named, one that is a mistake, and
 # how many edges between near and far a pixel has then.
 _WRAPPED_SHARE, _MANY_WRAPPED, _WRAPPED_EDGES = 0.02, 0.1, 5e-4
+# Pixels whose flow fits the motion that depth tells, over those that fit flow's best motion.
+_CROWD = 0.5
 _FARTHEST = 0.03  # a share of pixels at exactly the largest depth that means something
 _LARGEST_FACTORS = {"camera": 30.0, "depth": 1e5}
 
@@ -299,7 +301,11 @@ def _explanations(
         known = [pairs.motion, *known]
         starts = [pairs.motion, fit.least_costly(pairs, torch.stack(known)), *starts]
 
-    recorded, others = fitted(pairs, best_motion(pairs, *starts, steps=8), has_poses), []
+    best = best_motion(pairs, *starts, steps=8)
+    if has_poses and pairs.by_flow:  # what fits a crowd is no evidence against recorded motion
+        is_crowd = fit.fits_a_crowd(pairs, best)
+        best = torch.where(is_crowd[:, None, None], pairs.motion, best)
+    recorded, others = fitted(pairs, best, has_poses), []
     if has_poses and recorded.left < (_EXACT_PX if pairs.by_flow else INTERPOLATED_PX):
         return recorded, []
     left = median(px_of(residual(few, pairs.motion if has_poses else recorded.motion)))
@@ -399,6 +405,10 @@ def _other_times(recorded: _Fit, raw_px: float) -> str:
     # depth agrees with poses that flow agrees with, it is of one time.
     before = by_flow.minimum(by_poses.nan_to_num(math.inf))
     if px < _UNSURE * raw_px or median(before) < INTERPOLATED_PX or not is_better(after, before):
+        return ""
+    # A crowd that walks one way may be all that depth shows to move. Its flow then fits, too.
+    shares = fit.agreement(recorded.pairs, torch.stack(known[:2])).mean(-1)
+    if median(shares[1] / shares[0]) > _CROWD:
         return ""
     return f"depth moves otherwise than flow, by {px:.2g} px of {raw_px:.2g} px: is it of one time?"
 
