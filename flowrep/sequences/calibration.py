@@ -30,7 +30,7 @@ MIRROR_REMEDY = (
 class Camera(pydantic.BaseModel):
     """A camera in `intrinsics.json`, see docs/factorize.md."""
 
-    model_config = pydantic.ConfigDict(allow_inf_nan=False)
+    model_config = pydantic.ConfigDict(allow_inf_nan=False, extra="forbid")
 
     width: pydantic.PositiveInt
     height: pydantic.PositiveInt
@@ -53,7 +53,8 @@ def read_camera(path: Path) -> Camera:
     """Returns the content of an `intrinsics.json`."""
     remedy = (
         'it holds {"width": .., "height": .., "fx": .., "fy": .., "cx": .., "cy": .., '
-        '"first_pixel_centre": 0 (as OpenCV calibrates) or 0.5}'
+        '"first_pixel_centre": 0 (as OpenCV calibrates) or 0.5} and, of a lens that bends the '
+        'picture, "distortion" and "lens"'
     )
     try:
         return Camera.model_validate_json(regular(path).read_text("utf-8-sig", "replace"))
