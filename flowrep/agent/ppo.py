@@ -148,6 +148,7 @@ class PPO(Algorithm):
     ) -> None:
         self.options, self.num_envs = options, observation_spec.shape.numel()
         _, frames_per_round = options.first_update(self.num_envs)
+        rounds = total_frames // frames_per_round
         self.policy = self.make_policy(
             observation_spec, action_spec, keys, options, total_frames=total_frames, device=device
         )
@@ -161,9 +162,7 @@ class PPO(Algorithm):
         super().__init__(
             self.LOSS(network, actions, options),
             learning_rate=options.learning_rate,
-            total_updates=total_frames
-            // frames_per_round
-            * self._updates_of(options.rollout_length),
+            total_updates=rounds * self._updates_of(options.rollout_length),
             max_grad_norm=options.max_grad_norm,
         )
 

@@ -294,9 +294,9 @@ def best_motion(pairs: Pairs, *starts: Tensor, steps: int = 5) -> Tensor:
     return least_costly(rounds[-1], torch.stack(motions))
 
 
-def least_costly(few: Pairs, motions: Tensor) -> Tensor:
+def least_costly(pairs: Pairs, motions: Tensor) -> Tensor:
     """Returns that of motions `[M, P, 4, 4]` with which most pixels of each pair agree."""
-    agree = agreement(few, motions).mean(-1)
+    agree = agreement(pairs, motions).mean(-1)
     return motions[agree.argmax(0), torch.arange(agree.shape[1])]
 
 
