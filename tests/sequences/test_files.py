@@ -137,7 +137,7 @@ MISTAKES = [
     ("frames", "intrinsics.json", camera_json(first_pixel_centre=1), "first_pixel_centre"),
     # What is ignored makes flow wrong without a word.
     ("frames", "intrinsics.json", camera_json(colour={"fx": 30.0}), "colour"),
-    ("frames", "intrinsics.json", camera_json(distorsion=[0.1, 0, 0, 0]), "distorsion"),
+    ("frames", "intrinsics.json", camera_json(distortions=[0.1, 0, 0, 0]), "distortions"),
     ("frames", "intrinsics.json", ["{"], "JSON"),
     ("tum", "rgb.txt", ["2.0 rgb/b.png", "1.0 rgb/a.png"], "backwards"),
     ("tum", "groundtruth.txt", ["2 0 0 0 0 0 0 1", "1 0 0 0 0 0 0 1"], "backwards"),
