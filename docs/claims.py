@@ -4,16 +4,24 @@
 the episodes that all compared runs drove.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
-from itertools import count
+from itertools import chain, count
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from flowrep.report.figures import words
-from flowrep.report.runs import SCENES, Condition, Run, departures, paired_scores, success_rate
+from flowrep.report.runs import (
+    SCENES,
+    SPEEDS,
+    Condition,
+    Run,
+    departures,
+    paired_scores,
+    success_rate,
+)
 from flowrep.report.statistics import UNSEEN, Array, Effect, effect, holm, improvement, permuted_p
 
 SHORT = dict(zip(SCENES, ("SR", "ST", "H", "T")))
@@ -137,6 +145,7 @@ def _over(
 class Cell(NamedTuple):
     """A split of the speeds in one scene, for the study of held-out speeds."""
 
+    split: str  # "A"
     name: str  # "A SR"
     title: str
     mode: str  # the speed mode that training left out
@@ -157,6 +166,7 @@ def held_out_cells(declared: Mapping[str, Any], studies: Studies) -> list[Cell]:
     splits = declared["held_out"]["splits"]
     return [
         Cell(
+            split["name"],
             f"{split['name']} {SHORT[scene]}",
             f"{split['name']}, {words(scene)}",
             split["mode"],
@@ -169,26 +179,73 @@ def held_out_cells(declared: Mapping[str, Any], studies: Studies) -> list[Cell]:
 
 def held_out_claims(declared: Mapping[str, Any], cells: Sequence[Cell]) -> list[HeldOut]:
     """Returns the claims on held-out speeds, in the mean over cells, corrected together."""
-    found = []
-    for number, entry in enumerate(declared["held_out"]["claims"], start=1):
-        asked = entry | {"expect": "more", "success": {"held out": 1}}
-        every, without, lost = {}, {}, np.zeros(2, int)
-        for cell in cells:
-            sides, measure = _sides(asked, cell.runs), {"success": {cell.mode: 1}}
-            left = [[run for run in side if not is_collapsed(run)] for side in sides]
-            lost += [len(side) - len(kept) for side, kept in zip(sides, left)]
-            for strata, runs in ((every, sides), (without, left)):
-                rates = scores(runs, measure)
-                strata |= {cell.name: [rates]} if rates else {}
-        names = [cell.name for cell in cells]
+    standing = [cell._replace(runs=[r for r in cell.runs if not is_collapsed(r)]) for cell in cells]
+    names, found = [cell.name for cell in cells], []
+    for number, asked in enumerate(_asked(declared), start=1):
+        every, without = (
+            _rates(asked, of, lambda cell: {cell.mode: 1}) for of in (cells, standing)
+        )
         contrast = _over(asked, every, names)
         p = permuted_p([pair for pairs in every.values() for pair in pairs])
-        claim = Claim(number, entry["claim"], "", [contrast])
-        found.append(HeldOut(claim, p, tuple(lost.tolist()), _over(asked, without, names)))
+        sides = zip(*(_sides(asked, cell.runs) for cell in cells))
+        first, second = (sum(map(is_collapsed, chain(*of_cells))) for of_cells in sides)
+        claim = Claim(number, asked["claim"], "", [contrast])
+        found.append(HeldOut(claim, p, (first, second), _over(asked, without, names)))
     together = [each.claim.contrasts[0] for each in found]
     for contrast, p in zip(together, holm([contrast.p_value for contrast in together])):
         contrast.p_value = contrast.p_against = p
     return found
+
+
+def beside_held_out(
+    declared: Mapping[str, Any], cells: Sequence[Cell]
+) -> list[dict[str, Contrast]]:
+    """Returns the secondary contrasts of each claim on held-out speeds, by name."""
+
+    def held_out(cell: Cell) -> dict[str, int]:
+        return {cell.mode: 1}
+
+    def trained(cell: Cell) -> dict[str, int]:
+        return {cell.runs[0].speed: 1}
+
+    def lost(cell: Cell) -> dict[str, int]:
+        return {**trained(cell), cell.mode: -1}
+
+    def other(cell: Cell) -> dict[str, int]:
+        return dict.fromkeys({*SPEEDS} - {*lost(cell)}, 1)
+
+    splits = dict.fromkeys(cell.split for cell in cells)
+    measured: dict[str, tuple[Sequence[Cell], Callable[[Cell], dict[str, int]]]] = {
+        f"held out, {split}": ([cell for cell in cells if cell.split == split], held_out)
+        for split in splits
+    }
+    measured |= {
+        "as in training": (cells, trained),
+        "loss from training to held out": (cells, lost),
+    }
+    measured |= {"the paper's training, 1.2–1.8": (cells, other)}
+    return [
+        {
+            name: _over(asked, _rates(asked, of, weights), [cell.name for cell in of])
+            for name, (of, weights) in measured.items()
+        }
+        for asked in _asked(declared)
+    ]
+
+
+def _asked(declared: Mapping[str, Any]) -> list[dict[str, Any]]:
+    claims = declared["held_out"]["claims"]
+    return [entry | {"expect": "more", "success": {"held out": 1}} for entry in claims]
+
+
+def _rates(
+    asked: Mapping[str, Any], cells: Sequence[Cell], weights: Callable[[Cell], Mapping[str, int]]
+) -> dict[str, list[list[Array]]]:
+    """Returns the success of each run of both sides, by cell, in the cells that have both."""
+    found = {
+        cell.name: scores(_sides(asked, cell.runs), {"success": weights(cell)}) for cell in cells
+    }
+    return {name: [rates] for name, rates in found.items() if rates}
 
 
 def is_collapsed(run: Run) -> bool:

@@ -25,6 +25,7 @@ from docs.claims import (
     Contrast,
     HeldOut,
     Studies,
+    beside_held_out,
     claims_of,
     conditions_of,
     contrast_of,
@@ -128,6 +129,15 @@ def held_out_table(found: Sequence[HeldOut]) -> str:
         rows.append((number, text, *tested, cells, " and ".join(map(str, collapsed)), left_out))
     header = ("", "claim", "verdict", "effect [95 %], p (Holm)", "p by permutation")
     return _table((*header, "by split and scene", "collapsed", "without these"), rows)
+
+
+def beside_table(found: Sequence[Mapping[str, Contrast]]) -> str:
+    """Returns the secondary contrasts of the claims on held-out speeds."""
+    rows = [
+        (f"H{number}", *(points(c.effect.interval()) if c.effect else "" for c in of.values()))
+        for number, of in enumerate(found, start=1)
+    ]
+    return _table(("", *found[0]), rows)
 
 
 def cell_table(cell: Cell) -> str:
@@ -486,6 +496,8 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
             secondary=claims_table(secondary, "p"),
             recipes=recipes_table(primary, earlier),
             held_out=held_out_table(held_out_claims(declared, cells)) if cells else "",
+            beside=beside_table(beside_held_out(declared, cells)) if cells else "",
+            held_out_seeds=sorted({run.seed for cell in cells for run in cell.runs}),
             cells={cell.title: cell_table(cell) for cell in cells},
             held_out_figure=HELD_OUT_FIGURE,
             # row 14 against the paper's other stack of two frames, row 19 at each speed alone
