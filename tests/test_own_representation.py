@@ -112,6 +112,8 @@ def test_what_the_user_typed_is_used(config, folder):
     ):
         asked = command(model, *line, TYPED)
         assert run.config(asked.trusted).representations == config.representations
+    target = TYPED.partition("=")[2]
+    assert run.config(target).representations == config.representations  # one without a list
     with pytest.raises(UsageError, match="representations="):
         command(EvaluateConfig, "evaluate", "run=x", TYPED, "+representations.edges.factor=1.0")
 

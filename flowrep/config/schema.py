@@ -438,8 +438,9 @@ def validated_run(plain: Any, source: str, trusted: Collection[str] = ()) -> Tra
         for name, options in config.representations.items()
         if "_target_" in options
     }
+    known = {*ALGORITHMS, *([trusted] if isinstance(trusted, str) else trusted)}
     for key, target in named.items():
-        if target not in (*ALGORITHMS, *trusted):
+        if target not in known:
             raise UsageError(
                 f"{source} names code outside of flowrep, {target}: if you trust it, add "
                 f"{key}._target_={target}"

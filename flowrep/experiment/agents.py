@@ -121,7 +121,7 @@ class Agent(Driver):
             flow: the source of raw and obj, as in conf/flow; exact if None.
             motion: the source of the camera's motion, "exact" or "estimated"; exact if None.
             noise: errors of depth and of the camera's motion; none if None.
-            trusted: classes outside of flowrep that a run may name; their code then runs.
+            trusted: a class, or classes, outside of flowrep that a run may name; their code runs.
             precision: the number format of its networks, instead of the run's.
             device: of its networks and envs.
             num_envs: envs side by side; by default as many as in its training.

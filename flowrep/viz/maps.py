@@ -221,6 +221,8 @@ def representation_strip(
 @lru_cache(maxsize=64)
 def class_legend(names: tuple[str, ...], width: int) -> Image:
     """Returns the colours and names of classes, in as many rows as the width needs."""
+    if unknown := [name for name in names if name not in CLASS_COLOURS]:
+        raise ValueError(f"unknown categories {unknown}; known are {list(CLASS_COLOURS)}")
     columns = max(1, width // _CLASS_PX)
     legend = np.full((-(-len(names) // columns) * _NOTE_PX, width, 3), 255, np.uint8)
     texts = {}

@@ -176,6 +176,10 @@ def test_the_bar_of_depth_has_the_colours_of_depth_from_near_to_far():
         (lambda: viz.flow_to_rgb(flow_of(0, 0), 0.0), "scale_px must be positive"),
         (lambda: viz.depth_to_rgb(np.zeros((4, 4))), r"depth must be \[1, H, W\]"),
         (lambda: viz.representation_strip({"eggo": np.zeros(1)}), "eggo.*expected some of.*'ego'"),
+        (
+            lambda: viz.representation_strip({"ego": flow_of(0, 0)}, categories="road"),
+            r"unknown categories \['r', 'o', 'a', 'd'\]",
+        ),
         (lambda: viz.strip({"a": np.zeros((2, 3, 3)), "b": np.zeros((3, 2, 3))}), "needs images"),
     ],
 )
