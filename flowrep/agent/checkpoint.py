@@ -170,29 +170,3 @@ def _from_json(value: Any, get_tensor: Callable[[str], Tensor]) -> Any:
     if "tensor" in value:
         return get_tensor(value["tensor"])
     return {key: _from_json(item, get_tensor) for key, item in value["dict"].items()}
-
-
-def check_origin(saved: Mapping[str, Any], expected: Mapping[str, Any], path: Path) -> None:
-    """Checks that a checkpoint belongs to a run; the error names the first difference."""
-    if saved.get("flowrep") != expected["flowrep"]:
-        raise CheckpointError(
-            f"{path} was written by flowrep {saved.get('flowrep')}, this is {expected['flowrep']}: "
-            "install that version, or start a new run"
-        )
-    there, here = _flat(saved), _flat(expected)
-    for key in {**there, **here}:
-        was, now = there.get(key, "absent"), here.get(key, "absent")
-        if was != now:
-            raise CheckpointError(
-                f"{path} belongs to a run with {key}={was}, the config.yaml of its folder says "
-                f"{key}={now}: restore the file that was there, or start a new run"
-            )
-
-
-def _flat(config: Mapping[str, Any], section: str = "") -> dict[str, Any]:
-    """Returns nested values by their dotted keys; an empty mapping is a value."""
-    flat: dict[str, Any] = {}
-    for key, value in config.items():
-        nested = _flat(value, f"{section}{key}.") if isinstance(value, Mapping) else {}
-        flat |= nested or {f"{section}{key}": value}
-    return flat

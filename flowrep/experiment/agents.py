@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torchrl.data import Composite
 
-from flowrep.agent import CheckpointError, check_origin, load_checkpoint, save_checkpoint
+from flowrep.agent import CheckpointError, load_checkpoint, save_checkpoint
 from flowrep.baselines import BASELINES
 from flowrep.config import UsageError, closest_first
 from flowrep.config.cli import composed
@@ -37,7 +37,7 @@ from flowrep.experiment.evaluation import (
 )
 from flowrep.experiment.external import Task, check_card, load_policy
 from flowrep.experiment.outcomes import EpisodeRecord
-from flowrep.experiment.run import RunFolder, origin_of
+from flowrep.experiment.run import RunFolder, check_origin, origin_of
 from flowrep.experiment.runner import Runner
 from flowrep.progress import StopRequest
 from flowrep.scenes import Scene, load_scene

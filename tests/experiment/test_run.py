@@ -18,10 +18,10 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from flowrep.agent import CheckpointError, check_origin
+from flowrep.agent import CheckpointError
 from flowrep.experiment.lock import FolderInUseError, RunFolderError
 from flowrep.experiment.outcomes import EVALUATION_COLUMNS, EpisodeRecord
-from flowrep.experiment.run import RunFolder, machine_of, origin_of
+from flowrep.experiment.run import RunFolder, check_origin, machine_of, origin_of
 from flowrep.tables import TableError, write_rows
 from tests.config.composing import composed, plain
 
