@@ -31,7 +31,6 @@ from torch import Tensor
 from flowrep.files import naming, replace_file
 
 FORMAT = "flowrep checkpoint 7"
-_WITHOUT_DIGESTS = "flowrep checkpoint 6"
 
 
 class CheckpointError(Exception):
@@ -97,20 +96,18 @@ def load_checkpoint(
             safe_open(f"/dev/fd/{opened.fileno()}", framework="pt") as file,
         ):
             metadata = file.metadata() or {}
-            if metadata.get("format") not in (FORMAT, _WITHOUT_DIGESTS):
+            if metadata.get("format") != FORMAT:
                 raise CheckpointError(
                     f"{path} is a safetensors file but not a flowrep checkpoint of this version "
                     f"({FORMAT!r}); start a new run"
                 )
-            items = json.loads(metadata["state"])["dict"]
-            digests = json.loads(metadata["crc32"]) if metadata["format"] == FORMAT else None
-            names = items if parts is None else parts
-            if parts is None and digests is not None and {*digests} != {*items}:
+            items, digests = json.loads(metadata["state"])["dict"], json.loads(metadata["crc32"])
+            if parts is None and {*digests} != {*items}:
                 raise ValueError("its parts are not those that were saved")
             state = {}
-            for name in names:
+            for name in items if parts is None else parts:
                 state[name], digest = _read(items[name], file.get_tensor)
-                if digests is not None and digest != digests[name]:
+                if digest != digests[name]:
                     raise ValueError(f"{name!r} is not what was saved")
             return state
     except (SafetensorError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:

@@ -108,11 +108,7 @@ def test_options_reach_the_transforms():
         ({"depth": {"rangem": 3}}, r"'depth': 'rangem'.*'missing'"),
         ("ego", "must be a list of names.*'ego'"),
         ({"ego": 2.0}, r"representation 'ego' must be a mapping.*2\.0"),
-        ({"ego": {"scale": "2"}}, "scale must be .*'2'"),
         ({"raw": {"scale": torch.ones(2)}}, "scale must be .*tensor"),
-        ({"depth": {"range_m": None}}, "range_m must be .*None"),
-        ({"depth2": {"missing": "x"}}, "missing must be .*'x'"),
-        ({"depth2": {"k": [2]}}, r"k must be .*\[2\]"),
     ],
 )
 def test_mistakes_are_explained(representations, expected):
@@ -127,10 +123,8 @@ def test_mistakes_are_explained(representations, expected):
         ({"flow": {"source": "estimated", "presets": "fast"}}, "'presets'.*'preset'"),
         ({"flow": {"source": "exact", "preset": "fast"}}, "option of exact flow: 'preset'"),
         ({"flow": 2.5}, "unknown source of flow 2.5"),
-        ({"flow": {"source": "estimated", "min_side_px": None}}, "min_side_px must be .*None"),
         ({"motion": "odometry"}, r"'odometry'.*'estimated'"),
         ({"noise": 0.1}, "noise must be a mapping.*0.1"),
-        ({"noise": {"drift_rad": "x"}}, "drift_rad must be .*'x'"),
         ({"noise": {"depth_sigma": 0.1}}, "option of noise: 'depth_sigma'.*'depth_sigma_per_m'"),
         ({"noise": {"drift_m": -0.1}}, "drift_m must be a finite number of at least 0, got -0.1"),
     ],
