@@ -38,8 +38,6 @@ from flowrep.yaml_file import read_yaml
 if TYPE_CHECKING:
     import torch
 
-_EPISODE = ("scene", "scene_id", "frames", "evaluation", "policy", "speed", "fps", "episode_seed")
-"""The columns that identify a row of evaluation.csv."""
 DRIVES = "drives.npz"
 
 _IDENTITY = (
@@ -114,7 +112,7 @@ def cpu_name() -> str:
 
 
 class Drive(NamedTuple):
-    """The columns that identify an episode of drives.npz."""
+    """The columns that identify an episode of drives.npz and, with `scene`, of evaluation.csv."""
 
     scene_id: str
     evaluation: str
@@ -345,4 +343,4 @@ class RunFolder:
 
 
 def _identity(row: Mapping[str, str]) -> tuple[str, ...]:
-    return tuple(row[name] for name in _EPISODE)
+    return tuple(row[name] for name in ("scene", *Drive._fields))
