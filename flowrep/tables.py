@@ -46,7 +46,7 @@ def read_rows(
                 check(row[name])
             except ValueError:
                 raise TableError(
-                    f"{path}: {name} is {row[name]!r} in row {number}, which is never written: "
+                    f"{path}: {name} is {row[name]!r} in row {number}, which flowrep never writes: "
                     "restore the table, or move it aside"
                 ) from None
     return rows

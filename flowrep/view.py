@@ -22,7 +22,7 @@ from hydra.core.hydra_config import HydraConfig
 
 from flowrep.config import UsageError
 from flowrep.config.cli import folder_name, run_command
-from flowrep.config.schema import ViewConfig, check_policy
+from flowrep.config.schema import ViewConfig, check_policy, policy_kind
 from flowrep.files import replace_files
 from flowrep.progress import progress_bar
 from flowrep.scenes.scene import CATEGORY_ID
@@ -61,7 +61,7 @@ def agent_of(config: ViewConfig, is_scene_given: bool) -> Agent:
     """Returns what drives: a trained agent in the scene of its training, unless one was given."""
     from flowrep.experiment.agents import Agent
 
-    is_trained = Path(config.policy).is_dir() or config.policy.endswith(".safetensors")
+    is_trained = policy_kind(config.policy) in ("run", "saved") and config.policy != "pretrained"
     keeps_scene = is_trained and not is_scene_given
     return Agent.load(
         config.policy,

@@ -2,9 +2,7 @@
 
 import os
 import re
-import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -19,8 +17,9 @@ from flowrep.experiment.film import Film
 from flowrep.experiment.run import RunFolder
 from flowrep.train import resumed
 from tests.config.composing import composed, plain
+from tests.running import ENVIRONMENT, ROOT, run_python
 
-PAGE = Path(__file__).parents[1] / "docs" / "adding_a_representation.md"
+PAGE = ROOT / "docs" / "adding_a_representation.md"
 TYPED = "+representations.edges._target_=mine.Edges"
 
 
@@ -112,6 +111,8 @@ def test_what_the_user_typed_is_used(config, folder):
     ):
         asked = command(model, *line, TYPED)
         assert run.config(asked.trusted).representations == config.representations
+    target = TYPED.partition("=")[2]
+    assert run.config(target).representations == config.representations  # one without a list
     with pytest.raises(UsageError, match="representations="):
         command(EvaluateConfig, "evaluate", "run=x", TYPED, "+representations.edges.factor=1.0")
 
@@ -138,10 +139,8 @@ def test_a_name_that_is_none_is_never_printed_to_be_pasted(config, folder, name)
 @pytest.mark.slow
 def test_from_the_command_line(folder):
     def run(command, *arguments):
-        line = [sys.executable, "-m", f"flowrep.{command}", *arguments]
-        path = os.pathsep.join([str(folder), str(PAGE.parents[1])])
-        env = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
-        return subprocess.run(line, cwd=folder, env=env, capture_output=True, text=True)
+        env = ENVIRONMENT | {"PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])}
+        return run_python("-m", f"flowrep.{command}", *arguments, env=env, cwd=folder)
 
     done = run(
         "train", "--config-dir", "my_configs", "representations=[ego,edges]", "debug=smoke",

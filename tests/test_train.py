@@ -14,15 +14,13 @@ pytest.importorskip("pybullet", reason="training drives the simulated street")
 from flowrep.tables import read_rows
 from flowrep.train import main
 from flowrep.viz import is_playable
+from tests.running import ENVIRONMENT, run_python
 
 pytestmark = pytest.mark.slow
 
-ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1"}
-
 
 def command(name, *arguments, cwd):
-    line = [sys.executable, "-m", f"flowrep.{name}", *map(str, arguments)]
-    result = subprocess.run(line, cwd=cwd, capture_output=True, text=True, env=ENVIRONMENT)
+    result = run_python("-m", f"flowrep.{name}", *arguments, cwd=cwd)
     assert result.returncode == 0, result.stderr
     return result.stdout
 
@@ -65,8 +63,7 @@ def smoke_run(tmp_path_factory):
 )
 def test_help_and_refusals_need_no_pytorch_and_no_folder(tmp_path, line, code):
     name, *arguments = line.split()
-    command = [sys.executable, "-X", "importtime", "-m", f"flowrep.{name}", *arguments]
-    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=ENVIRONMENT)
+    result = run_python("-X", "importtime", "-m", f"flowrep.{name}", *arguments, cwd=tmp_path)
     assert result.returncode == code
     imported = {text.rpartition("|")[2].strip() for text in result.stderr.splitlines()}
     assert "pydantic" in imported

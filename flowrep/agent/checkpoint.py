@@ -31,7 +31,6 @@ from torch import Tensor
 from flowrep.files import naming, replace_file
 
 FORMAT = "flowrep checkpoint 7"
-_WITHOUT_DIGESTS = "flowrep checkpoint 6"
 
 
 class CheckpointError(Exception):
@@ -97,20 +96,18 @@ def load_checkpoint(
             safe_open(f"/dev/fd/{opened.fileno()}", framework="pt") as file,
         ):
             metadata = file.metadata() or {}
-            if metadata.get("format") not in (FORMAT, _WITHOUT_DIGESTS):
+            if metadata.get("format") != FORMAT:
                 raise CheckpointError(
                     f"{path} is a safetensors file but not a flowrep checkpoint of this version "
                     f"({FORMAT!r}); start a new run"
                 )
-            items = json.loads(metadata["state"])["dict"]
-            digests = json.loads(metadata["crc32"]) if metadata["format"] == FORMAT else None
-            names = items if parts is None else parts
-            if parts is None and digests is not None and {*digests} != {*items}:
+            items, digests = json.loads(metadata["state"])["dict"], json.loads(metadata["crc32"])
+            if parts is None and {*digests} != {*items}:
                 raise ValueError("its parts are not those that were saved")
             state = {}
-            for name in names:
+            for name in items if parts is None else parts:
                 state[name], digest = _read(items[name], file.get_tensor)
-                if digests is not None and digest != digests[name]:
+                if digest != digests[name]:
                     raise ValueError(f"{name!r} is not what was saved")
             return state
     except (SafetensorError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
@@ -170,29 +167,3 @@ def _from_json(value: Any, get_tensor: Callable[[str], Tensor]) -> Any:
     if "tensor" in value:
         return get_tensor(value["tensor"])
     return {key: _from_json(item, get_tensor) for key, item in value["dict"].items()}
-
-
-def check_origin(saved: Mapping[str, Any], expected: Mapping[str, Any], path: Path) -> None:
-    """Checks that a checkpoint belongs to a run; the error names the first difference."""
-    if saved.get("flowrep") != expected["flowrep"]:
-        raise CheckpointError(
-            f"{path} was written by flowrep {saved.get('flowrep')}, this is {expected['flowrep']}: "
-            "install that version, or start a new run"
-        )
-    there, here = _flat(saved), _flat(expected)
-    for key in {**there, **here}:
-        was, now = there.get(key, "absent"), here.get(key, "absent")
-        if was != now:
-            raise CheckpointError(
-                f"{path} belongs to a run with {key}={was}, the config.yaml of its folder says "
-                f"{key}={now}: restore the file that was there, or start a new run"
-            )
-
-
-def _flat(config: Mapping[str, Any], section: str = "") -> dict[str, Any]:
-    """Returns nested values by their dotted keys; an empty mapping is a value."""
-    flat: dict[str, Any] = {}
-    for key, value in config.items():
-        nested = _flat(value, f"{section}{key}.") if isinstance(value, Mapping) else {}
-        flat |= nested or {f"{section}{key}": value}
-    return flat

@@ -127,8 +127,8 @@ def map_codecs(
     observation_spec: Composite, keys: Sequence[NestedKey], dtype: torch.dtype
 ) -> tuple[MapCodec, ...]:
     """Returns one codec per key, in order, from the specs, whose last three dims are C, H, W."""
-    if not keys:
-        raise ValueError("the agent needs at least one observation key, got none")
+    if isinstance(keys, str) or not keys:
+        raise ValueError(f"the agent needs a list of observation keys, got {keys!r}")
     offered = observation_spec.keys(include_nested=True, leaves_only=True)
     for key in keys:
         if key not in offered:

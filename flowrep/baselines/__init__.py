@@ -23,16 +23,15 @@ def never_turn(env: StreetEnv) -> int:
 
 
 class RandomActions:
-    """Draws actions uniformly, with a generator for each `seed` and episode seed."""
+    """Draws actions uniformly, with a generator for each episode."""
 
-    def __init__(self, seed: int = 0) -> None:
-        self._seed = seed
-        self._rng = np.random.default_rng(seed)
+    def __init__(self) -> None:
+        self._rng = np.random.default_rng(0)
 
     def __call__(self, env: StreetEnv) -> int:
         """Returns one of the three actions."""
         if not env.episode.steps:
-            self._rng = np.random.default_rng((env.episode.seed, self._seed))
+            self._rng = np.random.default_rng((env.episode.seed, 0))
         return int(self._rng.integers(3))
 
 

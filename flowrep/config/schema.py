@@ -69,6 +69,13 @@ Distinct = BeforeValidator(_distinct)
 OneOrMore = BeforeValidator(_listed)
 """Lets a list of one be written without brackets."""
 
+Acting = Literal["greedy", "sampled"]
+"""How an agent acts in its final evaluation."""
+Actings = Annotated[list[Acting], Field(min_length=1), Distinct]
+SpeedModes = Annotated[list[SpeedMode], Field(min_length=1), Distinct]
+FrameRates = Annotated[list[FrameRate], Field(min_length=1), Distinct]
+BaselineNames = Annotated[list[BaselineName], Distinct]
+
 
 class Command(Options):
     """The whole config of a command; it keeps keys that it doesn't know, such as `+note=pilot`."""
@@ -191,20 +198,16 @@ class EnvConfig(Command):
         return self
 
 
-Acting = Literal["greedy", "sampled"]
-"""How an agent acts in its final evaluation."""
-
-
 class Evaluation(Options):
     """How the agent is evaluated while it learns and at the end."""
 
     every_frames: CountOrZero
     episodes: Count
     final_episodes: Count
-    speeds: Annotated[list[SpeedMode], Field(min_length=1), Distinct]
-    fps: Annotated[list[FrameRate], Field(min_length=1), Distinct]
-    policies: Annotated[list[Acting], Field(min_length=1), Distinct]
-    baselines: Annotated[list[BaselineName], Distinct]
+    speeds: SpeedModes
+    fps: FrameRates
+    policies: Actings
+    baselines: BaselineNames
     video: bool
 
     @property
@@ -218,11 +221,11 @@ class Episodes(BaseModel):
     """Arguments of `Agent.evaluate`."""
 
     episodes: Count
-    speeds: Annotated[list[SpeedMode], Field(min_length=1), Distinct]
-    fps: Annotated[list[FrameRate], Field(min_length=1), Distinct]
+    speeds: SpeedModes
+    fps: FrameRates
     seed: Seed
-    policies: Annotated[list[Acting], Field(min_length=1), Distinct]
-    baselines: Annotated[list[BaselineName], Distinct]
+    policies: Actings
+    baselines: BaselineNames
 
 
 class TrainConfig(EnvConfig):
@@ -270,12 +273,12 @@ class EvaluateConfig(Command):
     flow: Flow | None = None
     motion: MotionSource | None = None
     noise: Noise | None = None
-    speed: Annotated[list[SpeedMode], Field(min_length=1), Distinct, OneOrMore]
-    fps: Annotated[list[FrameRate], Field(min_length=1), Distinct, OneOrMore]
+    speed: Annotated[SpeedModes, OneOrMore]
+    fps: Annotated[FrameRates, OneOrMore]
     episodes: Count
     policy: Annotated[list[Text], Field(min_length=1), Distinct, OneOrMore]
     output: Text | None
-    baselines: Annotated[list[BaselineName], Distinct, OneOrMore]
+    baselines: Annotated[BaselineNames, OneOrMore]
     seed: Seed
     num_envs: Count
     num_workers: Workers
@@ -290,9 +293,9 @@ class EvaluateConfig(Command):
     @model_validator(mode="after")
     def _fits_together(self) -> EvaluateConfig:
         others = self.other_policies
-        for name in others:
-            is_file = name.endswith((".pt2", ".safetensors"))
-            if ":" not in name and not is_file and name != "pretrained":
+        kinds = {name: policy_kind(name) for name in others}
+        for name, kind in kinds.items():
+            if kind not in ("saved", "external"):
                 raise ValueError(
                     f"policy={name}: should be greedy, sampled, pretrained, path.py:make, "
                     "package.module:make, path.pt2 or path.safetensors"
@@ -303,9 +306,8 @@ class EvaluateConfig(Command):
             raise ValueError(f"run= and policy={others[0]} can't be combined: give one of them")
         if not others and self.run is None:
             raise ValueError("run needs a value: run=<a run's or a sweep's folder>")
-        for name in others:
-            is_trained = name == "pretrained" or name.endswith(".safetensors")
-            for key in ("scene",) if is_trained else ("scene", "representations"):
+        for name, kind in kinds.items():
+            for key in ("scene",) if kind == "saved" else ("scene", "representations"):
                 if getattr(self, key) is None:
                     raise ValueError(f"{key} needs a value for policy={name}")
         maps = (self.representations or {}).values()
@@ -438,8 +440,9 @@ def validated_run(plain: Any, source: str, trusted: Collection[str] = ()) -> Tra
         for name, options in config.representations.items()
         if "_target_" in options
     }
+    known = {*ALGORITHMS, *([trusted] if isinstance(trusted, str) else trusted)}
     for key, target in named.items():
-        if target not in (*ALGORITHMS, *trusted):
+        if target not in known:
             raise UsageError(
                 f"{source} names code outside of flowrep, {target}: if you trust it, add "
                 f"{key}._target_={target}"
@@ -447,20 +450,36 @@ def validated_run(plain: Any, source: str, trusted: Collection[str] = ()) -> Tra
     return config
 
 
+def policy_kind(name: str) -> str | None:
+    """Returns what `policy=` names, a "baseline", "run", "saved" or "external"; None for nothing.
+
+    A saved agent is "pretrained" or in a .safetensors file. An external policy, from another
+    project, is path.py:make, package.module:make or path.pt2.
+    """
+    if name in get_args(BaselineName):
+        return "baseline"
+    if name == "pretrained":
+        return "saved"
+    if Path(name).is_dir():  # its name may hold a colon
+        return "run"
+    if name.endswith(".safetensors"):
+        return "saved"
+    return "external" if ":" in name or name.endswith(".pt2") else None
+
+
 def check_policy(name: str) -> None:
     """Raises UsageError if `policy=` names no policy, as far as can be told without PyTorch."""
-    if Path(name).is_dir() or name in (*get_args(BaselineName), "pretrained"):
-        return
-    script, is_reference, _ = name.rpartition(":")
-    file, ends = (script, (".py",)) if is_reference else (name, (".pt2", ".safetensors"))
-    if file.endswith(ends):
-        if not Path(file).is_file():
-            raise UsageError(f"policy={name}: there is no file '{file}'")
-    elif not is_reference:
+    kind = policy_kind(name)
+    if kind is None:
         raise UsageError(
             f"policy={name}: give {', '.join(get_args(BaselineName))}, pretrained, a run's folder, "
             "path.safetensors, path.py:make, package.module:make or path.pt2"
         )
+    script, _, _ = name.rpartition(":")
+    file = script if script.endswith(".py") else name
+    is_file = file.endswith((".py", ".pt2", ".safetensors"))
+    if kind in ("saved", "external") and is_file and not Path(file).is_file():
+        raise UsageError(f"policy={name}: there is no file '{file}'")
 
 
 def check_options(maker: type, options: Mapping[str, Any], section: str) -> None:

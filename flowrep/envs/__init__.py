@@ -45,20 +45,10 @@ for _id, _scene in SCENE_BY_ID.items():
     )
 
 __all__ = [
-    "NumericInfo",
-    "Outcome",
-    "RepresentationObservation",
-    "StreetEnv",
-    "WorkerError",
-    "WorkerVectorEnv",
-    "begin_step",
-    "get_states",
-    "has_spare_cores",
-    "make_env",
-    "make_mirror",
-    "set_states",
-    "street_envs",
-]
+    "NumericInfo", "Outcome", "RepresentationObservation", "StreetEnv", "WorkerError",
+    "WorkerVectorEnv", "begin_step", "get_states", "has_spare_cores", "make_env", "make_mirror",
+    "set_states", "street_envs",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

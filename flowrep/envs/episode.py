@@ -95,7 +95,7 @@ class Episode:
     ) -> None:
         scene = layout.scene
         paths = {each.name: each for each in scene.paths}
-        if path is not None and path not in paths:
+        if path not in (None, *paths):
             raise ValueError(f"unknown path {path!r}; the scene has {[*paths]}")
         # A seed's episode depends on the order of the draws: first the path, then the people.
         rng = np.random.default_rng(episode_seed)

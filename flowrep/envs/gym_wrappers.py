@@ -64,7 +64,8 @@ class RepresentationObservation(gym.Wrapper):
             intrinsics = torch.from_numpy(inner.K)
         if num_classes is None:
             num_classes = getattr(inner, "num_classes", None)
-        asked = _onehot(representations) if joined else representations
+        is_list = not isinstance(representations, str)  # which the stack refuses by its whole name
+        asked = _onehot(representations) if joined and is_list else representations
         self._stack = representation_stack(asked, intrinsics=intrinsics, num_classes=num_classes)
         self._now = TensorDict()
         self.observation_space = self._space(env.observation_space)

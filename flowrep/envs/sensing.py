@@ -34,7 +34,10 @@ class Sensing:
     @classmethod
     def shared(cls, street: Street, sensors: Sequence[str], renderer: str, scale: int) -> "Sensing":
         """Returns the one that all envs of the process with these options share."""
-        key = street, tuple(sensors), renderer, scale
+        if not hasattr(scale, "__index__") or scale < 1:
+            raise ValueError(f"picture_scale must be a whole number of at least 1, got {scale!r}")
+        names = (sensors,) if isinstance(sensors, str) else tuple(sensors)
+        key = street, names, renderer, scale
         sensing = _SHARED.get(key)
         if sensing is None:
             sensing = _SHARED[key] = cls(*key)
@@ -54,8 +57,6 @@ class Sensing:
         self._vehicle_from_cam = camera.vehicle_from_camera(config)
         self._ids_by_number = street.ids_by_number()
         self.renderer, self._scale = camera.choose_renderer(renderer), scale
-        if scale < 1 or scale % 1 != 0:
-            raise ValueError(f"picture_scale must be a whole number of at least 1, got {scale}")
         if scale != 1 and self.renderer == "pybullet":
             remedy = "needs renderer 'rasteriser'; give 1 with 'pybullet'"
             raise ValueError(f"picture_scale={scale} {remedy}")

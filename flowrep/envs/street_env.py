@@ -1,7 +1,6 @@
 """The gymnasium env of a street."""
 
 import math
-import operator
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -176,15 +175,16 @@ class StreetEnv(gym.Env):
         vehicle_speed_mps = options.get("vehicle_speed_mps")
         if vehicle_speed_mps is None:
             vehicle_speed_mps = self.scene.vehicle.speed_mps
-        if not 0 <= vehicle_speed_mps < math.inf:
-            raise ValueError(f"vehicle_speed_mps is {vehicle_speed_mps}; give m/s, 0 for rest")
-        episode_seed = operator.index(options["episode_seed"])
-        if not 0 <= episode_seed < 1 << 63:  # TensorDicts hold it as int64
-            raise ValueError(f"episode_seed is {episode_seed}; give 0 to 2**63 - 1")
+        if not 0 <= _number(vehicle_speed_mps) < math.inf:
+            raise ValueError(f"vehicle_speed_mps is {vehicle_speed_mps!r}; give m/s, 0 for rest")
+        episode_seed = options["episode_seed"]
+        # TensorDicts hold it as int64.
+        if not hasattr(episode_seed, "__index__") or not 0 <= episode_seed < 1 << 63:
+            raise ValueError(f"episode_seed is {episode_seed!r}; give an int, 0 to 2**63 - 1")
         self._episode = Episode(
             self._street.layout,
             checked_frame_rate(self.scene, options.get("frame_rate_hz", self.frame_rate_hz)),
-            episode_seed,
+            int(episode_seed),
             _speed_range(self.scene, options.get("speed", self.speed_mps)),
             float(vehicle_speed_mps),
             options.get("path"),
@@ -207,8 +207,8 @@ def _speed_range(scene: Scene, speed: SpeedMode | Range) -> Range:
             raise ValueError(f"unknown speed {speed!r}; choose one of {modes}, or give (low, high)")
         return scene.pedestrian_speed_mps[speed]
     try:
-        low, high = (float(bound) for bound in speed)
-    except (TypeError, ValueError):  # not two numbers
+        low, high = map(_number, speed)
+    except (TypeError, ValueError):  # not two values
         low = high = math.nan
     if not 0 <= low <= high < math.inf:
         raise ValueError(f"speed is {speed!r}; give (lowest, highest) in m/s, or a mode's name")
@@ -217,11 +217,21 @@ def _speed_range(scene: Scene, speed: SpeedMode | Range) -> Range:
 
 def checked_frame_rate(scene: Scene, frame_rate_hz: float | None) -> float:
     """Returns a frame rate in 1/s, the scene's for None; ValueError if it is out of range."""
-    rate = scene.frame_rate_hz if frame_rate_hz is None else float(frame_rate_hz)
+    rate = _number(scene.frame_rate_hz if frame_rate_hz is None else frame_rate_hz)
     lowest, highest = FRAME_RATES_HZ
     if not lowest <= rate <= highest:
-        raise ValueError(f"frame_rate_hz is {rate}; give a rate from {lowest:g} to {highest:g}")
+        given = f"frame_rate_hz is {frame_rate_hz!r}"
+        raise ValueError(f"{given}; give a rate from {lowest:g} to {highest:g}")
     return rate
+
+
+def _number(value: Any) -> float:
+    """Returns a number as a float, nan for anything else."""
+    # Not from geometry.checks, since workers step envs without PyTorch.
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return math.nan
 
 
 def _plain(moment: Moment) -> dict[str, Any]:

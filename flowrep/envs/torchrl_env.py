@@ -21,6 +21,7 @@ from flowrep.scenes.scene import Range, Scene, SpeedMode, num_classes
 from flowrep.scenes.vehicle import YAW_SIGN
 from flowrep.simulator.camera import choose_renderer, sensor_intrinsics
 from flowrep.transforms import Mirror, representation_stack
+from flowrep.transforms.base import as_keys
 from flowrep.transforms.stack import FLOWS, DropKeys, Representations
 
 
@@ -32,7 +33,7 @@ def usable_device(device: str | torch.device) -> torch.device:
     """
     try:
         return torch.empty(0, device=device).device
-    except (RuntimeError, AssertionError) as error:  # AssertionError: a PyTorch without CUDA
+    except (RuntimeError, TypeError, AssertionError) as error:  # the last: built without CUDA
         reason = str(error).splitlines()[0]
         raise ValueError(f"device={device} can't be used: {reason}. Try device=cpu") from None
 
@@ -124,6 +125,7 @@ def make_env(
     """
     num_envs = checked_count("num_envs", num_envs)
     num_workers = checked_count("num_workers", num_workers, least=0)
+    seed = None if seed is None else checked_count("seed", seed, least=0)
     device = usable_device(device)
     loaded = load_scene(scene)
     # An estimator and its pictures need one scale; that of a mapping counts.
@@ -167,18 +169,18 @@ def make_env(
 
 
 def make_mirror(
-    scene: str | Path | Mapping[str, Any] | Scene, representations: Iterable[str]
+    scene: str | Path | Mapping[str, Any] | Scene, representations: str | Iterable[str]
 ) -> Mirror:
     """Returns the transform that replaces half of a replay batch by mirror images.
 
     Args:
         scene: as for `make_env`; its camera determines which columns mirror each other.
-        representations: the keys of the maps, as in `make_env`.
+        representations: the key of a map, or several keys, as in `make_env`.
 
     >>> make_mirror("straight_road", ["ego", "seg2"]).swapped_actions
     tensor([0, 2, 1])
     """
-    names, K = list(representations), sensor_intrinsics(load_scene(scene).camera)
+    names, K = as_keys(representations), sensor_intrinsics(load_scene(scene).camera)
     flows = [name for name in names if name in FLOWS]
     swapped = [YAW_SIGN.index(-sign) for sign in YAW_SIGN]
     return Mirror(names, flow_keys=flows, swapped_actions=swapped, intrinsics=K.tolist())

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 from torchrl.data import Composite
 
-from flowrep.agent import CheckpointError, check_origin, load_checkpoint, save_checkpoint
-from flowrep.baselines import BASELINES
+from flowrep.agent import CheckpointError, load_checkpoint, save_checkpoint
 from flowrep.config import UsageError, closest_first
 from flowrep.config.cli import composed
 from flowrep.config.schema import (
@@ -24,6 +23,7 @@ from flowrep.config.schema import (
     Noise,
     TrainConfig,
     check_policy,
+    policy_kind,
     validated,
     validated_run,
 )
@@ -37,7 +37,7 @@ from flowrep.experiment.evaluation import (
 )
 from flowrep.experiment.external import Task, check_card, load_policy
 from flowrep.experiment.outcomes import EpisodeRecord
-from flowrep.experiment.run import RunFolder, origin_of
+from flowrep.experiment.run import RunFolder, check_origin, origin_of
 from flowrep.experiment.runner import Runner
 from flowrep.progress import StopRequest
 from flowrep.scenes import Scene, load_scene
@@ -121,7 +121,7 @@ class Agent(Driver):
             flow: the source of raw and obj, as in conf/flow; exact if None.
             motion: the source of the camera's motion, "exact" or "estimated"; exact if None.
             noise: errors of depth and of the camera's motion; none if None.
-            trusted: classes outside of flowrep that a run may name; their code then runs.
+            trusted: a class, or classes, outside of flowrep that a run may name; their code runs.
             precision: the number format of its networks, instead of the run's.
             device: of its networks and envs.
             num_envs: envs side by side; by default as many as in its training.
@@ -132,12 +132,10 @@ class Agent(Driver):
             CheckpointError: a file is damaged, or the agent can't act in this scene.
         """
         check_policy(name := str(name))
+        kind = policy_kind(name)
         where = {"device": str(device), "num_envs": num_envs, "num_workers": num_workers}
         machine = {k: v for k, v in validated(Machine, where) if v is not None}
         given_scene = None if scene is None else load_scene(scene)
-        is_folder = Path(name).is_dir()  # of a run, whose name may hold a colon
-        is_saved = not is_folder and name.endswith(".safetensors")
-        is_external = not (is_folder or is_saved) and (":" in name or name.endswith(".pt2"))
         if isinstance(representations, str):
             raise UsageError(f"representations: give a list, ['{representations}']")
         if representations is None or isinstance(representations, Mapping):
@@ -145,21 +143,21 @@ class Agent(Driver):
         else:
             names = {"representations": [*representations]}
             maps = composed("train", names, TrainConfig)[0].representations
-        if not is_external:
+        if kind != "external":
             # A `_target_` alone only trusts a class that a run names; `trusted` has it.
             chosen = [each for each in maps.values() if {*(each or {})} != {"_target_"}] or None
             given = {"representations": chosen, "flow": flow, "motion": motion, "noise": noise}
             for key, value in given.items():
                 if value is not None:
                     raise UsageError(f"{key}= is for a policy of your own, not for policy={name}")
-        if name in BASELINES or is_external:
+        if kind in ("baseline", "external"):
             if precision is not None:
                 raise UsageError(f"precision= is for a trained agent, not for policy={name}")
-            if is_external and not maps:
+            if kind == "external" and not maps:
                 raise UsageError(f"representations needs a value for policy={name}")
             values = {"flow": flow, "motion": motion, "noise": noise} | machine
-            config = _config_without_run(given_scene, maps if is_external else {}, values)
-            return cls(_external(name, config) if is_external else name, config)
+            config = _config_without_run(given_scene, maps if kind == "external" else {}, values)
+            return cls(_external(name, config) if kind == "external" else name, config)
         trained, frames, weights = _stored(name, given_scene, trusted)
         section = trained.algorithm
         if precision is not None and hasattr(build.algorithm(section)[1], "precision"):
@@ -255,8 +253,7 @@ def _stored(
     name: str, scene: Scene | None, trusted: Collection[str]
 ) -> tuple[TrainConfig, int, dict[str, Tensor]]:
     """Returns config, frames and weights of a trained agent."""
-    is_folder = Path(name).is_dir()
-    if name == "pretrained" or (name.endswith(".safetensors") and not is_folder):
+    if policy_kind(name) == "saved":
         path = _pretrained(scene) if name == "pretrained" else Path(name)
         stored = load_checkpoint(path, ["config", "frames", "policy"])
         config = validated_run(stored["config"], path.name, trusted)

@@ -1,4 +1,4 @@
-"""Films of episodes, and the picture of a run's learning curve."""
+"""Films of episodes."""
 
 import math
 import textwrap
@@ -20,7 +20,7 @@ from torchrl.data import Categorical
 from flowrep.baselines import BaselinePolicy
 from flowrep.envs import street_envs
 from flowrep.experiment.evaluation import Driver, evaluate
-from flowrep.experiment.outcomes import EpisodeRecord, outcome_shares
+from flowrep.experiment.outcomes import EpisodeRecord
 from flowrep.files import replace_file
 from flowrep.scenes.vehicle import YAW_SIGN
 from flowrep.simulator.camera import choose_renderer
@@ -360,49 +360,3 @@ def _page(size: tuple[int, int], text: str, key: Image | None) -> Image:
         for i, line in enumerate(lines)
     }
     return written(page, texts, size=_TEXT_PX) if texts else page
-
-
-def draw_learning_curve(
-    path: Path,
-    metrics: Iterable[Mapping[str, str]],
-    episodes: Iterable[Mapping[str, str]],
-    *,
-    speed: str,
-    fps: float,
-) -> None:
-    """Draws a run's success over frames, from the rows of metrics.csv and evaluation.csv.
-
-    The line is the success rate over the last training episodes (sampled actions); the points are
-    the run's greedy evaluations at its speed and frame rate, with 95 % Wilson intervals. If a
-    training evaluation and the final one share a frame count, only the final one is drawn.
-    """
-    from matplotlib.figure import Figure  # the import takes a tenth of a command's start
-
-    figure = Figure(figsize=(7, 4), layout="constrained")
-    axes = figure.add_subplot(
-        xlabel="environment frames", ylabel="share of episodes that succeed", ylim=(0, 1)
-    )
-    points = [(int(row["frames"]), float(row["success"])) for row in metrics]
-    axes.plot(*zip(*points) if points else ([], []), label="training, sampled actions")
-    outcomes: dict[str, dict[int, list[str]]] = {kind: {} for kind in ("training", "final")}
-    for row in episodes:
-        is_own = row["evaluation"] in outcomes and row["policy"] == "greedy"
-        if is_own and (row["speed"], float(row["fps"])) == (speed, fps):
-            of_kind = outcomes[row["evaluation"]]
-            of_kind.setdefault(int(row["frames"]), []).append(row["outcome"])
-    evaluations = outcomes["training"] | outcomes["final"]
-    for number, (frames, names) in enumerate(sorted(evaluations.items())):
-        share, low, high = outcome_shares(names)["success"]
-        axes.errorbar(
-            frames,
-            share,
-            [[share - low], [high - share]],
-            fmt="o",
-            color="C1",
-            capsize=3,
-            clip_on=False,  # an agent may succeed always
-            label=None if number else "evaluation, greedy actions",
-        )
-    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False)  # covers no curve
-    axes.grid(alpha=0.3)
-    replace_file(path, partial(figure.savefig, dpi=120, format="png"))

@@ -47,7 +47,7 @@ class FolderLock:
             is_plain = False
         if not is_plain:
             raise RunFolderError(
-                f"'{self._path}' is a link, or not a regular file; no run creates such: remove it"
+                f"'{self._path}' is a link, or not a regular file, which no run creates: remove it"
             )
 
     def take(self, doing: str) -> bool:

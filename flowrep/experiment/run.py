@@ -14,7 +14,7 @@ import subprocess
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -32,16 +32,13 @@ from flowrep.experiment.outcomes import (
     read_episodes,
 )
 from flowrep.files import replace_file, replace_text, set_aside
-from flowrep.tables import append_rows, is_whole, read_rows, write_rows
+from flowrep.tables import TableError, append_rows, is_whole, read_rows, write_rows
 from flowrep.yaml_file import read_yaml
 
 if TYPE_CHECKING:
     import torch
 
-_EPISODE = ("scene", "scene_id", "frames", "evaluation", "policy", "speed", "fps", "episode_seed")
-"""The columns that identify a row of evaluation.csv."""
-_DRIVE = ("scene_id", "evaluation", "frames", "policy", "speed", "fps", "episode_seed")
-"""The columns that identify an episode of drives.npz."""
+DRIVES = "drives.npz"
 
 _IDENTITY = (
     "scene", "representations", "flow", "motion", "noise", "algorithm", "speed", "seed", "num_envs",
@@ -55,6 +52,34 @@ def origin_of(config: Mapping[str, Any]) -> dict[str, Any]:
     # It is only for presets that choose `algorithm.mirror`; no street depends on it.
     parts["scene"].pop("symmetric", None)
     return {"flowrep": __version__, **parts}
+
+
+def check_origin(saved: Mapping[str, Any], expected: Mapping[str, Any], path: Path) -> None:
+    """Checks that a checkpoint belongs to a run; the error names the first difference."""
+    from flowrep.agent import CheckpointError
+
+    if saved.get("flowrep") != expected["flowrep"]:
+        raise CheckpointError(
+            f"{path} was written by flowrep {saved.get('flowrep')}, this is {expected['flowrep']}: "
+            "install that version, or start a new run"
+        )
+    there, here = flattened(saved), flattened(expected)
+    for key in {**there, **here}:
+        was, now = there.get(key, "absent"), here.get(key, "absent")
+        if was != now:
+            raise CheckpointError(
+                f"{path} belongs to a run with {key}={was}, the config.yaml of its folder says "
+                f"{key}={now}: restore the file that was there, or start a new run"
+            )
+
+
+def flattened(config: Mapping[str, Any], section: str = "") -> dict[str, Any]:
+    """Returns nested values by their dotted keys; an empty mapping is a value."""
+    flat: dict[str, Any] = {}
+    for key, value in config.items():
+        nested = flattened(value, f"{section}{key}.") if isinstance(value, Mapping) else {}
+        flat |= nested or {f"{section}{key}": value}
+    return flat
 
 
 def machine_of(precision: torch.dtype) -> dict[str, Any]:
@@ -86,6 +111,40 @@ def cpu_name() -> str:
     return next(iter(names), platform.processor() or platform.machine())
 
 
+class Drive(NamedTuple):
+    """The columns that identify an episode of drives.npz and, with `scene`, of evaluation.csv."""
+
+    scene_id: str
+    evaluation: str
+    frames: int
+    policy: str
+    speed: str
+    fps: float
+    episode_seed: int
+
+
+def read_drives(path: Path) -> dict[Drive, tuple[str, NDArray[np.float32]]]:
+    """Returns each drive's outcome and positions `[T + 1, 2]`, x and y in metres.
+
+    Without a file there are none. It holds the columns of `Drive`; `outcome`; `positions`
+    `[sum of T + 1, 2]`; and `starts` `[N + 1]`, so that drive n is
+    `positions[starts[n]:starts[n + 1]]`.
+
+    Raises:
+        TableError: the file is damaged.
+    """
+    if not path.is_file():
+        return {}
+    try:
+        with np.load(path, allow_pickle=False) as saved:
+            names = zip(*(saved[column].tolist() for column in Drive._fields), strict=True)
+            positions = np.split(saved["positions"].reshape(-1, 2), saved["starts"][1:-1])
+            driven = zip(saved["outcome"].tolist(), positions, strict=True)
+            return dict(zip(map(Drive._make, names), driven, strict=True))
+    except Exception as error:  # zip, zlib and numpy fail on garbage in a dozen ways
+        raise TableError(f"{path}: {error}") from error
+
+
 class RunFolder:
     """The files of one run, by name; docs/runs.md says what is in them."""
 
@@ -95,7 +154,7 @@ class RunFolder:
         self.metrics_path = self.path / "metrics.csv"
         self.checkpoint_path = self.path / "checkpoint" / "latest.safetensors"
         self.evaluation_path = self.path / "evaluation.csv"
-        self.drives_path = self.path / "drives.npz"
+        self.drives_path = self.path / DRIVES
         self.failures_path = self.path / "failures.csv"
         self.curve_path = self.path / "learning_curve.png"
         self.loggers = Loggers(self.path)
@@ -263,34 +322,20 @@ class RunFolder:
         write_rows(self.evaluation_path, [*kept, *new], EVALUATION_COLUMNS)
 
     def _save_drives(self, records: Iterable[EpisodeRecord]) -> None:
-        """Adds the vehicles' positions to drives.npz; they replace those of the same episodes.
-
-        It holds `positions` [sum of T + 1, 2], x and y in metres; `starts` [N + 1], so that episode
-        n is `positions[starts[n]:starts[n + 1]]`; the columns that identify each episode; and its
-        `outcome`.
-        """
-        drives = self._read_drives()
+        """Adds the vehicles' positions to drives.npz; they replace those of the same episodes."""
+        try:
+            drives = read_drives(self.drives_path)
+        except TableError as error:
+            set_aside(self.drives_path, error.__cause__)
+            drives = {}
         for each in records:
-            drives[tuple(getattr(each, name) for name in _DRIVE)] = each.outcome, each.positions
+            drive = Drive(*(getattr(each, name) for name in Drive._fields))
+            drives[drive] = each.outcome, each.positions
         outcomes, positions = zip(*drives.values())
-        arrays: dict[str, Any] = {name: np.array(all_) for name, all_ in zip(_DRIVE, zip(*drives))}
+        arrays: dict[str, Any] = dict(zip(Drive._fields, map(np.array, zip(*drives))))
         arrays["outcome"], arrays["positions"] = np.array(outcomes), np.concatenate(positions)
         arrays["starts"] = np.cumsum([0, *map(len, positions)])
         replace_file(self.drives_path, lambda path: np.savez_compressed(path, **arrays))
-
-    def _read_drives(self) -> dict[tuple[Any, ...], tuple[str, NDArray[np.float32]]]:
-        """Returns outcomes and positions in drives.npz by episode; sets a damaged file aside."""
-        if not self.drives_path.is_file():
-            return {}
-        try:
-            with np.load(self.drives_path, allow_pickle=False) as saved:
-                names = zip(*(saved[column].tolist() for column in _DRIVE), strict=True)
-                positions = np.split(saved["positions"], saved["starts"][1:-1])
-                driven = zip(saved["outcome"].tolist(), positions, strict=True)
-                return dict(zip(names, driven, strict=True))
-        except Exception as error:  # zip, zlib and numpy fail on garbage in a dozen ways
-            set_aside(self.drives_path, error)
-            return {}
 
     def write_failures(self) -> None:
         """Writes the causes of the failures in evaluation.csv to failures.csv."""
@@ -298,4 +343,4 @@ class RunFolder:
 
 
 def _identity(row: Mapping[str, str]) -> tuple[str, ...]:
-    return tuple(row[name] for name in _EPISODE)
+    return tuple(row[name] for name in ("scene", *Drive._fields))

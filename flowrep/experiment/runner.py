@@ -16,7 +16,6 @@ from torch import Tensor
 
 from flowrep.agent import (
     DivergenceError,
-    check_origin,
     keep_freed_memory,
     load_checkpoint,
     save_checkpoint,
@@ -34,7 +33,7 @@ from flowrep.experiment.evaluation import (
     PairedEvaluation,
 )
 from flowrep.experiment.outcomes import OUTCOMES, print_results
-from flowrep.experiment.run import RunFolder, machine_of, origin_of
+from flowrep.experiment.run import RunFolder, check_origin, machine_of, origin_of
 from flowrep.progress import Every, StopRequest, Stopwatch, progress_bar
 
 
@@ -181,7 +180,8 @@ class Runner:
     def plot_and_film(self) -> None:
         """Writes causes of failure and the learning curve; films an episode if none is filmed."""
         # drawing takes seconds to import
-        from flowrep.experiment.film import draw_learning_curve, record_episode
+        from flowrep.experiment.film import record_episode
+        from flowrep.experiment.learning_curve import draw_learning_curve
         from flowrep.viz import is_playable
 
         self.close()  # its worker processes take memory, and so does filming

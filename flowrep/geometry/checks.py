@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Any, get_args
 
 import torch
@@ -75,11 +77,27 @@ def check_name(option: str, name: object, names: Any) -> None:
 
 def checked_count(option: str, count: float, least: int = 1, most: int | None = None) -> int:
     """Returns a whole number as an int; raises ValueError for a fraction, or one out of range."""
-    is_whole = not isinstance(count, str) and count % 1 == 0
-    if not is_whole or count < least or (most is not None and count > most):
+    number = _as_float(count)
+    if number % 1 != 0 or number < least or (most is not None and number > most):  # nan % 1 is nan
         limits = f"of at least {least}" if most is None else f"from {least} to {most}"
         raise ValueError(f"{option} must be a whole number {limits}, got {count!r}")
     return int(count)
+
+
+def checked_number(option: str, number: Any, wanted: str, fits: Callable[[float], bool]) -> float:
+    """Returns a finite number that `fits` as a float; raises ValueError with what was `wanted`."""
+    value = _as_float(number)
+    if not (math.isfinite(value) and fits(value)):
+        raise ValueError(f"{option} must be {wanted}, got {number!r}")
+    return value
+
+
+def _as_float(value: Any) -> float:
+    """Returns a number as a float, nan for anything else; a number in quotes is a mistake."""
+    try:
+        return math.nan if isinstance(value, str) else float(value)
+    except (ArithmeticError, RuntimeError, TypeError, ValueError):  # a tensor raises RuntimeError
+        return math.nan
 
 
 def check_rows(lowest: int, highest: int, rows: int) -> None:

@@ -1,28 +1,24 @@
-"""A self-contained HTML page of a report, with the drives and films that evaluations saved.
-
-`RunFolder`, which writes drives.npz, describes its content.
-"""
+"""A self-contained HTML page of a report, with the drives and films that evaluations saved."""
 
 import base64
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
-from zipfile import BadZipFile
 
-import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from flowrep.experiment.run import DRIVES, read_drives
 from flowrep.report.figures import encoded, words
 from flowrep.report.runs import Run, groups_of, scenes_of
 from flowrep.report.sections import Report
 from flowrep.report.tables import listed
 from flowrep.scenes import SceneError, load_scene
 from flowrep.scenes.layout import Layout
+from flowrep.tables import TableError
 from flowrep.viz import OUTCOME_COLOURS
 from flowrep.viz.plan import Track, draw_plan
 
-DRIVES = "drives.npz"
 TEMPLATES = Environment(
     loader=FileSystemLoader(Path(__file__).parent),
     autoescape=lambda name: name is not None and name.endswith(".html.jinja"),
@@ -94,19 +90,17 @@ def tracks_of(run: Run, count: int) -> list[Track]:
     if run.folder is None or not count:
         return []
     try:
-        with np.load(run.folder / DRIVES) as saved:
-            shown = (saved["policy"] == "greedy") & (saved["speed"] == run.speed)
-            shown &= (saved["fps"] == run.fps) & (saved["frames"] >= run.total_frames)
-            shown &= saved["evaluation"] != "training"
-            shown &= np.isin(saved["outcome"], [*OUTCOME_COLOURS])
-            chosen = np.flatnonzero(shown)
-            chosen = chosen[np.argsort(saved["episode_seed"][chosen], kind="stable")][:count]
-            positions = saved["positions"].reshape(-1, 2).astype(float)
-            starts, outcomes = saved["starts"], saved["outcome"][chosen].tolist()
-        tracks = [positions[starts[n] : starts[n + 1]] for n in chosen]
-    except (OSError, ValueError, LookupError, TypeError, EOFError, BadZipFile):
+        drives = read_drives(run.folder / DRIVES)
+    except TableError:
         return []
-    return list(map(Track, tracks, outcomes))
+    here = {*run.episodes["scene_id"][run.tested].tolist()}  # not drives through another scene
+    tracks = {}
+    for drive, (outcome, positions) in drives.items():
+        as_trained = ("greedy", run.speed, run.fps) == (drive.policy, drive.speed, drive.fps)
+        is_final = drive.evaluation != "training" and drive.frames >= run.total_frames
+        if as_trained and is_final and drive.scene_id in here and outcome in OUTCOME_COLOURS:
+            tracks[drive.episode_seed] = Track(positions.astype(float), outcome)
+    return [tracks[seed] for seed in sorted(tracks)[:count]]
 
 
 def films_of(run: Run) -> list[Path]:

@@ -1,6 +1,6 @@
 """Runs for a report: which of them may be compared, and the success of their episodes."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, reduce
 from itertools import product
@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrep.experiment.run import origin_of
+from flowrep.experiment.run import flattened, origin_of
 from flowrep.report.statistics import Array, Estimate, mean_share
 
 Columns = dict[str, NDArray[Any]]
@@ -98,15 +98,7 @@ def _settings(config: Mapping[str, Any]) -> dict[str, str]:
     scene = parts.pop("scene")
     shared = {key: scene.pop(key) for key in _OF_EVERY_SCENE if key in scene}
     parts["scene"] = shared | {scene["name"]: scene}
-    return {key: str(value) for key, value in _flat(parts) if value != {}}
-
-
-def _flat(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    if isinstance(value, Mapping) and value:
-        for key, inner in value.items():
-            yield from _flat(inner, f"{prefix}.{key}" if prefix else str(key))
-    else:
-        yield prefix, _plain(value)
+    return {key: str(_plain(value)) for key, value in flattened(parts).items() if value != {}}
 
 
 def _plain(value: Any) -> Any:

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrl.data import Categorical, Composite, TensorSpec, Unbounded
 
 from flowrep import geometry
-from flowrep.geometry.checks import first_wrong
+from flowrep.geometry.checks import checked_number, first_wrong
 from flowrep.transforms import base
 from flowrep.transforms.base import (
     Keys,
@@ -452,10 +452,8 @@ def _scales(scale: float | Mapping[str, float], flows: Sequence[str]) -> dict[st
     scales = scale if isinstance(scale, Mapping) else dict.fromkeys(flows, scale)
     if set(scales) != set(flows):
         raise ValueError(f"scale needs one value for each of {list(flows)}, got {dict(scales)}")
-    for factor in scales.values():
-        if not math.isfinite(factor) or factor == 0.0:
-            raise ValueError(f"scale must be a finite number other than 0, got {factor}")
-    return {name: float(scales[name]) for name in flows}
+    wanted = "a finite number other than 0"
+    return {n: checked_number("scale", scales[n], wanted, lambda x: x != 0) for n in flows}
 
 
 def as_intrinsics(intrinsics: Tensor | Sequence[Sequence[float]]) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Sequence
 from typing import Literal
@@ -13,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, TensorSpec
 
 from flowrep import geometry
-from flowrep.geometry.checks import check_name, checked_count
+from flowrep.geometry.checks import check_name, checked_count, checked_number
 from flowrep.transforms.base import DEPTH, IDS, RGB, Keys, MapTransform, check_distinct_keys
 
 Encoding = Literal["ids", "onehot"]
@@ -159,11 +158,10 @@ class Depth(MapTransform):
         out_keys: Keys = "depth",
     ) -> None:
         super().__init__([DEPTH], in_keys, out_keys)
-        if not 0 < range_m < math.inf:
-            raise ValueError(f"range_m must be a positive number of metres, got {range_m}")
-        if not 0 <= missing <= 1:
-            raise ValueError(f"missing must be in [0, 1], the value for nan, got {missing}")
-        self.range_m, self.missing = float(range_m), float(missing)
+        metres = "a positive number of metres"
+        self.range_m = checked_number("range_m", range_m, metres, lambda x: x > 0)
+        share = "in [0, 1], the value for nan"
+        self.missing = checked_number("missing", missing, share, lambda x: 0 <= x <= 1)
 
     def compute(self, depth: Tensor) -> tuple[Tensor]:
         """Returns depth / range_m in [0, 1]."""

@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 
-from flowrep.geometry.checks import checked_count
+from flowrep.geometry.checks import checked_count, checked_number
 from flowrep.geometry.pose import rotation_from_vector
 from flowrep.transforms import base
 from flowrep.transforms.base import Keys, MapTransform, Reads, as_keys, check_choice
@@ -227,8 +227,7 @@ def drifted_motion(
 
 def _check_options(sensors: Sequence[str], options: dict[str, float]) -> None:
     for name, value in options.items():
-        if not 0.0 <= value < math.inf:
-            raise ValueError(f"{name} must be a finite number of at least 0, got {value}")
+        checked_number(name, value, "a finite number of at least 0", lambda x: x >= 0)
         (sensor,) = (sensor for sensor in NOISY_SENSORS if name in NOISY_SENSORS[sensor].options)
         if value and sensor not in sensors:
             raise ValueError(f"{name} needs {sensor!r} among sensors, got {list(sensors)}")

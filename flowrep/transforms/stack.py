@@ -178,6 +178,14 @@ def _check_known(what: str, names: Iterable[object], known: Collection[str]) -> 
             raise ValueError(f"unknown {what} {name!r}; known are {list(known)}")
 
 
+def _known_options(whose: str, given: Any, known: Collection[str]) -> Options:
+    """Returns the options that were given; raises ValueError if one of them is unknown."""
+    if not isinstance(given, Mapping | None):
+        raise ValueError(f"options of {whose} must be a mapping from name to value, got {given!r}")
+    _check_known(f"option of {whose}:", given or {}, known)
+    return dict(given or {})
+
+
 def _with_options(representations: Representations) -> tuple[dict[str, Options], dict[str, Any]]:
     """Returns the representations with all of their options, and the user's transforms, by name."""
     if isinstance(representations, str) or not representations:
@@ -200,19 +208,17 @@ def _with_options(representations: Representations) -> tuple[dict[str, Options],
             foreign[name] = given
             continue
         options = representation_options(name)
-        _check_known(f"option of representation {name!r}:", given or {}, options)
-        chosen[name] = options | dict(given or {})
+        chosen[name] = options | _known_options(f"representation {name!r}", given, options)
     return chosen, foreign
 
 
 def _estimator_options(flow: str | Mapping[str, Any]) -> Options | None:
     """Returns `EstimatedFlow`'s options, or None if flow is exact."""
-    given: Options = {"source": flow} if isinstance(flow, str) else dict(flow)
-    source = given.get("source")
-    options = {name: value for name, value in given.items() if name != "source"}
+    options: Options = dict(flow) if isinstance(flow, Mapping) else {"source": flow}
+    source = options.pop("source", None)
     _check_known("source of flow", [source], _SOURCES)
     known = _ESTIMATOR_OPTIONS if source == "estimated" else ()
-    _check_known(f"option of {source} flow:", options, known)
+    _known_options(f"{source} flow", options, known)
     return options if source == "estimated" else None
 
 
@@ -226,8 +232,7 @@ def _noise(
     """
     options = {sensor: NOISY_SENSORS[sensor].options for sensor in _NOISY_KEYS}
     known = dict.fromkeys((name for names in options.values() for name in names), 0.0)
-    _check_known("option of noise:", noise or {}, known)
-    given: Options = known | dict(noise or {})
+    given: Options = known | _known_options("noise", noise, known)
     SensorNoise(**given)  # checks all values, used or not
     split = [name for name in chosen if name in ("ego", "obj")]
     readers = {  # raw flow is exact or estimated from pictures: it needs no noisy sensor

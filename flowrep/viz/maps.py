@@ -203,7 +203,7 @@ def representation_strip(
     """
     if tiles is None:
         tiles = stock_tiles(flow_scale_px=flow_scale_px, depth_range_m=depth_range_m)
-    names = set(maps.keys())
+    names, framed = set(maps.keys()), _listed(framed)
     shown = {name: tile for name, tile in tiles.items() if name in names}
     if not shown:
         given = sorted(map(str, names))
@@ -214,7 +214,7 @@ def representation_strip(
         notes={tile.label: tile.note for tile in shown.values() if tile.note},
         framed=[tile.label for name, tile in shown.items() if name in framed],
     )
-    legend = class_legend(tuple(categories), drawn.shape[1])
+    legend = class_legend(_listed(categories), drawn.shape[1])
     return np.concatenate([drawn, legend])
 
 
@@ -271,7 +271,7 @@ def strip(
     if any(h * width != w * height for h, w in sizes):
         raise ValueError(f"a strip needs images of one ratio of height to width, got {sizes}")
     zoom = tile_zoom(height, width)
-    with_wheel = frozenset(wheel_for)
+    with_wheel, framed = _listed(wheel_for), _listed(framed)
     # A column for each image: label, note (if any image has one, so that all stand level), image.
     columns: list[Image] = []
     for label, image in images.items():
@@ -352,6 +352,11 @@ def written(image: Image, texts: Mapping[tuple[int, int], tuple[Any, ...]], *, s
     for position, (text, anchor, colour) in texts.items():
         draw.text(position, text, fill=colour, font=font, anchor=anchor)
     return np.array(picture)
+
+
+def _listed(names: str | Iterable[str]) -> tuple[str, ...]:
+    """Returns names as a tuple; a text is a single name."""
+    return (names,) if isinstance(names, str) else tuple(names)
 
 
 def _picture(rgb: Any) -> Image:

@@ -1,3 +1,5 @@
+import re
+
 import pytest
 import torch
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
@@ -90,5 +92,6 @@ def test_keys_may_be_nested_and_a_missing_one_lists_what_there_is():
     assert map_codecs(spec, [("view", "ego")], torch.float32)[0].channels == 2
     with pytest.raises(KeyError, match=r"reads 'obj'; the environment offers .*'ego'"):
         map_codecs(spec, ["obj"], torch.float32)
-    with pytest.raises(ValueError, match="at least one"):
-        map_codecs(spec, [], torch.float32)
+    for keys in ([], "obj"):  # not the keys 'o', 'b' and 'j'
+        with pytest.raises(ValueError, match=f"list .*, got {re.escape(repr(keys))}"):
+            map_codecs(spec, keys, torch.float32)

@@ -103,13 +103,6 @@ def test_a_final_evaluation_has_as_many_episodes_as_was_asked():
     assert config.evaluation.final_total == 5 * 2 * 2
 
 
-def test_everything_that_is_wrong_is_said_at_once():
-    message = refusal("train", TrainConfig, "algorithm.gamma=2 evaluation.episodes=0 seed=x")
-    assert {line.split(":")[0] for line in message.splitlines()} == {
-        "seed", "evaluation.episodes", "algorithm.gamma"
-    }  # fmt: skip
-
-
 def test_representations_keep_the_order_of_the_command_line():
     config = composed("representations=[seg2,ego,obj]")
     assert list(config.plain()["representations"]) == ["seg2", "ego", "obj"]

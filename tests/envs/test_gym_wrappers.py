@@ -128,3 +128,5 @@ def test_an_env_of_ones_own_is_wrapped_by_its_camera():
         RepresentationObservation(Wall(), ["raw"], intrinsics=K)
     with pytest.raises(ValueError, match="need intrinsics="):
         RepresentationObservation(Wall(), ["ego"])
+    with pytest.raises(ValueError, match=r"list of names.*'ego'"):
+        RepresentationObservation(Wall(), "ego", intrinsics=K)

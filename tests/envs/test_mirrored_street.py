@@ -66,6 +66,10 @@ def test_maps_of_the_mirrored_street(name):
         )
 
 
+def test_a_single_map_is_mirrored_by_its_name():
+    assert make_mirror("straight_road", "ego").flow_keys == ["ego"]
+
+
 def with_flow(frame, K):
     raw = rigid_flow(frame["depth"], frame["instance"], K, frame["instance_motion"]).flow
     ego, obj, _ = factorize(raw, frame["depth"], K, frame["prev_from_curr"])

@@ -95,7 +95,13 @@ def test_no_environments_and_too_many_workers_are_refused(num_envs, num_workers,
         make_env("straight_road", num_envs=num_envs, num_workers=num_workers)
 
 
-@pytest.mark.parametrize("device", ["cuda:93", "gpu"])
+@pytest.mark.parametrize("seed", ["x", 2.5, -1])
+def test_a_seed_that_is_no_whole_number_is_refused(seed):
+    with pytest.raises(ValueError, match=f"^seed .*{seed}"):
+        make_env("straight_road", seed=seed)
+
+
+@pytest.mark.parametrize("device", ["cuda:93", "gpu", 2.5])
 def test_a_device_that_can_not_be_used_is_named_at_once(device):
     with pytest.raises(ValueError, match=rf"^device={device} .*device=cpu$"):
         make_env("straight_road", device=device)

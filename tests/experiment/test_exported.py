@@ -1,6 +1,5 @@
 """An exported agent gives what the agent gives, with torch alone."""
 
-import json
 import shutil
 import subprocess
 import sys
@@ -204,13 +203,6 @@ def test_the_loader_alone_notices_a_damaged_program(copied):
     (copied / "agent.pt2").write_bytes(data)
     with pytest.raises(PolicyError, match=r"agent\.pt2"):
         loaded(copied / "load_agent.py:make", "cpu")
-
-
-def test_an_export_from_before_there_were_digests_is_used(copied):
-    card = json.loads((copied / "agent.json").read_text())
-    del card["crc32"]
-    (copied / "agent.json").write_text(json.dumps(card))
-    assert refused(copied, "agent.pt2") is None
 
 
 def test_the_files_of_an_export_are_like_any_others_and_the_loader_may_be_edited(copied):

@@ -1,4 +1,4 @@
-"""Films of episodes and the learning curve."""
+"""Films of episodes."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from torchrl.data import Bounded
 pytest.importorskip("pybullet", reason="the simulated street is driven")
 
 from flowrep.experiment.agents import Agent
-from flowrep.experiment.film import LEGEND_S, Film, draw_learning_curve, record_episode
+from flowrep.experiment.film import LEGEND_S, Film, record_episode
 from flowrep.transforms import Depth
 from flowrep.viz import OUTCOME_COLOURS
 from tests.config.composing import composed
@@ -208,21 +208,3 @@ def test_a_recorded_episode_is_a_whole_film(tmp_path):
     played = imageio.imread(path, plugin="FFMPEG")
     assert len(played) == 6 * LEGEND_S + episode.length + 6
     assert [file.name for file in tmp_path.iterdir()] == ["episode.mp4"]
-
-
-def test_the_curve_shows_the_runs_own_greedy_evaluations_at_its_own_speed(tmp_path, monkeypatch):
-    from matplotlib.axes import Axes
-
-    drawn = []
-    monkeypatch.setattr(Axes, "errorbar", lambda self, x, y, *_, **__: drawn.append((x, y)))
-    row = {"evaluation": "training", "policy": "greedy", "speed": "normal", "fps": "12.0"}
-    row |= {"frames": "100", "outcome": "success"}
-    others = {"evaluation": "evaluate", "policy": "sampled", "speed": "low", "fps": "6.0"}
-    rows = [row, row | {"outcome": "timeout"}, row | {"evaluation": "final", "frames": "200"}]
-    rows += [row | {key: value} for key, value in others.items()]
-    rows.append(row | {"frames": "200", "outcome": "timeout"})  # other episodes than the final ones
-    metrics = [{"frames": "50", "success": "0.5"}, {"frames": "100", "success": "nan"}]
-    for points, episodes in ((metrics, rows), ([], [])):
-        draw_learning_curve(tmp_path / "a.png", points, episodes, speed="normal", fps=12.0)
-    assert drawn == [(100, 0.5), (200, 1.0)]
-    assert [file.name for file in tmp_path.iterdir()] == ["a.png"]

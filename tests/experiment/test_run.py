@@ -18,10 +18,10 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from flowrep.agent import CheckpointError, check_origin
+from flowrep.agent import CheckpointError
 from flowrep.experiment.lock import FolderInUseError, RunFolderError
 from flowrep.experiment.outcomes import EVALUATION_COLUMNS, EpisodeRecord
-from flowrep.experiment.run import RunFolder, machine_of, origin_of
+from flowrep.experiment.run import RunFolder, check_origin, machine_of, origin_of, read_drives
 from flowrep.tables import TableError, write_rows
 from tests.config.composing import composed, plain
 
@@ -433,7 +433,6 @@ def test_an_evaluation_run_again_leaves_the_table_of_one_that_was_never_stopped(
 HEADER = ",".join(EVALUATION_COLUMNS)
 ROW = ",".join(cells(episode(1)).values())
 DAMAGED = {
-    "an outcome that is none": f"{HEADER}\n{ROW.replace('collision', 'collisiom')}\n",
     "frames that are no number": f"{HEADER}\n{','.join(cells(episode(1), frames='1O').values())}\n",
     "semicolons": f"{HEADER}\n{ROW}\n".replace(",", ";"),
     "a column less": f"{HEADER.replace(',hit', '')}\n{ROW.rpartition(',')[0]}\n",
@@ -471,10 +470,8 @@ def test_a_cell_that_can_not_be_is_named_with_its_row(tmp_path):
 
 
 def drives(run):
-    with np.load(run.drives_path) as saved:
-        ends = zip(saved["starts"], saved["starts"][1:])
-        driven = [saved["positions"][a:b].tolist() for a, b in ends]
-        return dict(zip(saved["episode_seed"].tolist(), driven))
+    saved = read_drives(run.drives_path).items()
+    return {drive.episode_seed: (outcome, points.tolist()) for drive, (outcome, points) in saved}
 
 
 def without(run, name):
@@ -512,7 +509,7 @@ def test_damaged_drives_cost_no_episode_and_are_set_aside(tmp_path, capsys, dama
     capsys.readouterr()
     run.log_episodes([episode(2, positions=2 * ROAD)], drives=True)
     assert [row["episode_seed"] for row in run.read_episodes()] == ["1", "2"]
-    assert drives(run) == {2: (2 * ROAD).tolist()}
+    assert drives(run) == {2: ("collision", (2 * ROAD).tolist())}
     (aside,) = (path for path in tmp_path.glob("drives*") if path != run.drives_path)
     assert aside.read_bytes() == before
     (said,) = capsys.readouterr().err.splitlines()
@@ -525,9 +522,9 @@ def test_whole_drives_are_added_to(tmp_path):
     run.log_episodes([episode(1)], drives=True)
     again = [episode(2, positions=2 * ROAD), episode(1, positions=3 * ROAD, outcome="timeout")]
     run.log_episodes(again, drives=True)
-    assert drives(run) == {1: (3 * ROAD).tolist(), 2: (2 * ROAD).tolist()}
+    driven = {1: ("timeout", (3 * ROAD).tolist()), 2: ("collision", (2 * ROAD).tolist())}
+    assert drives(run) == driven
     with np.load(run.drives_path) as saved:  # once, though it ended differently, as elsewhere
-        assert dict(zip(saved["episode_seed"], saved["outcome"])) == {1: "timeout", 2: "collision"}
         assert len(saved["outcome"]) == 2
 
 

@@ -13,9 +13,10 @@ pytest.importorskip("jinja2", reason="reports are an extra")
 
 from flowrep.config import CONF_DIR
 from flowrep.config.schema import ReportConfig
+from flowrep.experiment.run import DRIVES
 from flowrep.report.__main__ import main, report
 from flowrep.report.figures import draw_bars, encoded
-from flowrep.report.page import DRIVES, drives_of, tracks_of
+from flowrep.report.page import drives_of, tracks_of
 from flowrep.report.runs import Condition, grid_of
 from flowrep.report.storage import read_run, read_runs
 from tests.report.folders import config_of, letters, rows_of, run_in, write_run
@@ -121,6 +122,7 @@ def write_drives(folder, **changes):
     saved = {
         "positions": np.arange(12, dtype=np.float32).reshape(6, 2),
         "starts": np.array([0, 2, 5, 6]),
+        "scene_id": np.array([""] * 3),  # as in the table
         "evaluation": np.array(["final"] * 3),
         "policy": np.array(["greedy"] * 3),
         "speed": np.array(["normal"] * 3),
@@ -143,6 +145,7 @@ def test_tracks_are_those_of_the_first_episodes(tmp_path):
 def test_only_greedy_drives_of_the_finished_agent_as_it_was_trained_are_drawn(tmp_path):
     run = run_in(tmp_path, "run", "sco")
     others = {"evaluation": "training", "policy": "sampled", "speed": "low", "fps": 6, "frames": 5}
+    others["scene_id"] = "1a2b3c4d"  # it may be evaluated in another scene, too
     for key, value in others.items():
         write_drives(run, **{key: np.full(3, value)})
         assert tracks_of(read_run(run), 2) == [], key

@@ -107,6 +107,8 @@ def test_options_reach_the_transforms():
         (["ego", "obj", "ego"], "'ego' is named twice"),
         ({"depth": {"rangem": 3}}, r"'depth': 'rangem'.*'missing'"),
         ("ego", "must be a list of names.*'ego'"),
+        ({"ego": 2.0}, r"representation 'ego' must be a mapping.*2\.0"),
+        ({"raw": {"scale": torch.ones(2)}}, "scale must be .*tensor"),
     ],
 )
 def test_mistakes_are_explained(representations, expected):
@@ -120,7 +122,9 @@ def test_mistakes_are_explained(representations, expected):
         ({"flow": "guessed"}, r"unknown source of flow 'guessed'.*\['exact', 'estimated'\]"),
         ({"flow": {"source": "estimated", "presets": "fast"}}, "'presets'.*'preset'"),
         ({"flow": {"source": "exact", "preset": "fast"}}, "option of exact flow: 'preset'"),
+        ({"flow": 2.5}, "unknown source of flow 2.5"),
         ({"motion": "odometry"}, r"'odometry'.*'estimated'"),
+        ({"noise": 0.1}, "noise must be a mapping.*0.1"),
         ({"noise": {"depth_sigma": 0.1}}, "option of noise: 'depth_sigma'.*'depth_sigma_per_m'"),
         ({"noise": {"drift_m": -0.1}}, "drift_m must be a finite number of at least 0, got -0.1"),
     ],

@@ -148,6 +148,15 @@ def test_a_frame_is_around_the_named_maps_alone():
     assert not orange[:, :-170].any()
 
 
+def test_a_name_is_a_list_of_one_and_not_of_its_letters():
+    shown = {"raw": np.zeros((20, 30, 3), np.uint8), "aw": np.zeros((20, 30, 3), np.uint8)}
+    for option in ("wheel_for", "framed"):
+        image = viz.strip(shown, **{option: "raw"})
+        np.testing.assert_array_equal(image, viz.strip(shown, **{option: ["raw"]}))
+    one, listed = (viz.representation_strip(maps(), categories=c) for c in ("road", ["road"]))
+    np.testing.assert_array_equal(one, listed)
+
+
 def test_a_map_in_grey_is_black_at_its_least_and_white_at_its_most():
     values = np.array([[[-3.0, -1.0, 0.0, 3.0, 9.0, np.nan]]])
     # 0 is a quarter of the way from -1 to 3
