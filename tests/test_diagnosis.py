@@ -22,7 +22,19 @@ from flowrep import diagnose, geometry
 from flowrep.diagnosis import Examination
 from flowrep.geometry.pose import rotation_from_vector
 from tests.injected import matrix, mistakes
-from tests.injected.sources import ENVS, RECORDINGS, crowd, realsense, room, street
+from tests.injected.sources import (
+    CAMERA,
+    ENVS,
+    RECORDINGS,
+    crowd,
+    euler,
+    filmed,
+    hand_held,
+    realsense,
+    rigid,
+    room,
+    street,
+)
 
 
 def only(source, mistake):
@@ -62,6 +74,38 @@ def test_a_crowd_that_another_motion_fits_better_is_no_mistake(
     found = matrix.of_recording(taken)
     assert found.is_right, found
     assert any("move" in note for note in found.notes)
+
+
+def behind_a_box(side):
+    """The room from a camera that drives straight on, behind a box that is as fast."""
+    poses = np.array([
+        rigid(euler(0, 0.06, 0) @ CAMERA, (-1.5 + 0.12 * t, 0, 1.2)) for t in range(8)
+    ])  # fmt: skip
+    box = np.array([1.2, 0, side]), np.array([0.12, 0, 0]), np.array([0.5, side, side])
+    return filmed(0, poses, [box]).with_(rgb=None)
+
+
+def test_a_vehicle_ahead_that_fills_most_of_the_picture_is_no_mistake():
+    taken = behind_a_box(0.75)
+    assert (taken.ids > 0).mean() == pytest.approx(0.59, abs=0.005)
+    noise = 0.1 * np.random.default_rng(0).normal(size=taken.flow.shape)
+    found = matrix.of_recording(taken.with_(flow=taken.flow + noise))
+    assert found.is_right, found
+
+
+def test_depth_that_a_camera_leaves_unseen_as_it_backs_out_is_no_mistake():
+    pytest.importorskip("pybullet", reason="the streets are PyBullet's")
+    ahead = street(0, 24, (48, 48), "straight_road", 25)
+    depth, poses = (getattr(ahead, name)[::-1].copy() for name in ("depth", "poses"))
+    assert matrix.of_env(ahead.with_(depth=depth, poses=poses, ids=None, moved=None)).is_right
+
+
+def test_noise_of_depth_is_no_mistake_of_a_camera_that_hardly_moves():
+    taken, random = filmed(3, hand_held(3, 0.08 * np.arange(10)), []), np.random.default_rng(0)
+    noise = 0.008 * taken.depth**2 * random.normal(size=taken.depth.shape)
+    found = matrix.of_env(taken.with_(depth=taken.depth + noise))
+    assert found.pairs > 0
+    assert not found.is_wrong, found
 
 
 @pytest.mark.slow_after_first

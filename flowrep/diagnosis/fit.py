@@ -296,29 +296,33 @@ def best_motion(pairs: Pairs, *starts: Tensor, steps: int = 5) -> Tensor:
 
 def least_costly(pairs: Pairs, motions: Tensor) -> Tensor:
     """Returns that of motions `[M, P, 4, 4]` with which most pixels of each pair agree."""
-    agree = agreement(pairs, motions).mean(-1)
+    agree = agreement(pairs, residual(pairs, motions)).mean(-1)
     return motions[agree.argmax(0), torch.arange(agree.shape[1])]
 
 
-def fits_a_crowd(pairs: Pairs, motion: Tensor) -> Tensor:
-    """Returns in which pairs a motion gives up pixels that the recorded one fits, `[P]`.
+def fits_a_crowd(pairs: Pairs, left: Tensor) -> Tensor:
+    """Returns in which pairs `[P]` what leaves `left` gives up pixels that recorded motion fits.
 
     Where much of the picture moves, another motion may fit more pixels than the right one. It gives
     up those that the right one fits, in whole parts of the picture. What corrects a wrong motion
     gives up next to none: noise evens out over a part.
     """
-    agree = agreement(pairs, torch.stack([pairs.motion, motion]))
+    agree = agreement(pairs, torch.stack([residual(pairs, pairs.motion), left]))
     column, row = parts(pairs, *PARTS)
     gained = torch.zeros(agree.shape[1], math.prod(PARTS), dtype=torch.float64)
     gained.scatter_add_(-1, column + PARTS[0] * row, agree[1] - agree[0])
     return (gained - _DEARER * (-gained).clamp(min=0)).sum(-1) < 0
 
 
-def agreement(pairs: Pairs, motions: Tensor) -> Tensor:
-    """Returns how much pixels agree with motions `[M, P, 4, 4]`, 0 to 1, `[M, P, N]`."""
-    squared = residual(pairs, motions).square().sum(-2)
+def agreement(pairs: Pairs, left: Tensor) -> Tensor:
+    """Returns how much pixels agree with M motions that leave `[M, P, C, N]`, 0 to 1, `[M, P, N]`.
+
+    Pixels that a motion moves out of the picture tell nothing of it: they agree as with the first.
+    """
+    squared = left.square().sum(-2)
     scale = torch.stack([scale_of(each, pairs) for each in squared]).amin(0).square().unsqueeze(-1)
-    agree = (1 / (1 + squared / scale)).nan_to_num(0.0)
+    agree = 1 / (1 + squared / scale)
+    agree = torch.where(agree.isnan(), agree[0], agree).masked_fill(agree[0].isnan(), 0.0)
     if not pairs.by_flow:  # no interpolated edge is a reason to leave the first
         agree[0] += 0.02
     return agree

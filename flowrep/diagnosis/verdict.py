@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -146,7 +146,7 @@ def diagnosed(
         return Diagnosis("wrong", f"{ways}; now {size} are left", **numbers)
     is_rough = error > _ROUGH * raw_px + _ROUGH_WIDTHS * width
     is_rough |= error > max(_TIMES_THE_NOISE * median(recorded.spread), _LITTLE * raw_px)
-    if able or recorded.is_unexplained or is_rough:
+    if able or recorded.is_unexplained or (is_rough and error > least):
         why = f"{size} are left, which none of {len(rivals)} known mistakes explains"
         why += f"; a motion exists that would leave {best_px:.2g} px" if pairs.has_poses else ""
         why += f"; nearest: {ways}" if able else ""
@@ -257,7 +257,7 @@ class _Fit:
             return self.error
         known, others = self.halves
         agree = [
-            fit.agreement(half, torch.stack([self.pairs.motion, motion])).mean(-1)
+            fit.agreement(half, residual(half, torch.stack([self.pairs.motion, motion]))).mean(-1)
             for half, motion in zip(known, others[::-1])
         ]
         better = torch.stack([now < then for now, then in agree])
@@ -301,9 +301,9 @@ def _explanations(
         known = [pairs.motion, *known]
         starts = [pairs.motion, fit.least_costly(pairs, torch.stack(known)), *starts]
 
-    best = best_motion(pairs, *starts, steps=8)
+    best, is_crowd = best_motion(pairs, *starts, steps=8), torch.zeros(len(none), dtype=torch.bool)
     if has_poses and pairs.by_flow:  # what fits a crowd is no evidence against recorded motion
-        is_crowd = fit.fits_a_crowd(pairs, best)
+        is_crowd = fit.fits_a_crowd(pairs, residual(pairs, best))
         best = torch.where(is_crowd[:, None, None], pairs.motion, best)
     recorded, others = fitted(pairs, best, has_poses), []
     if has_poses and recorded.left < (_EXACT_PX if pairs.by_flow else INTERPOLATED_PX):
@@ -322,7 +322,11 @@ def _explanations(
             if not median(px_of(few_left)) <= left:
                 continue
             motion = best_motion(changed, changed.motion)
-        others.append(fitted(changed, motion, has_poses, rival, n))
+        other = fitted(changed, motion, has_poses, rival, n)
+        if is_crowd.any():  # nor is a rival that fits it
+            is_its = is_crowd & fit.fits_a_crowd(pairs, residual(changed, motion))
+            other = replace(other, spread=other.spread.masked_fill(is_its, math.inf))
+        others.append(other)
     return recorded, others
 
 
@@ -407,7 +411,8 @@ def _other_times(recorded: _Fit, raw_px: float) -> str:
     if px < _UNSURE * raw_px or median(before) < INTERPOLATED_PX or not is_better(after, before):
         return ""
     # A crowd that walks one way may be all that depth shows to move. Its flow then fits, too.
-    shares = fit.agreement(recorded.pairs, torch.stack(known[:2])).mean(-1)
+    left = residual(recorded.pairs, torch.stack(known[:2]))
+    shares = fit.agreement(recorded.pairs, left).mean(-1)
     if median(shares[1] / shares[0]) > _CROWD:
         return ""
     return f"depth moves otherwise than flow, by {px:.2g} px of {raw_px:.2g} px: is it of one time?"
