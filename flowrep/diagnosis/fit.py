@@ -307,7 +307,8 @@ def fits_a_crowd(pairs: Pairs, left: Tensor) -> Tensor:
     up those that the right one fits, in whole parts of the picture. What corrects a wrong motion
     gives up next to none: noise evens out over a part.
     """
-    agree = agreement(pairs, torch.stack([residual(pairs, pairs.motion), left]))
+    first = residual(pairs, pairs.motion)
+    agree = agreement(pairs, torch.stack([first, torch.where(left.isnan(), first, left)]))
     column, row = parts(pairs, *PARTS)
     gained = torch.zeros(agree.shape[1], math.prod(PARTS), dtype=torch.float64)
     gained.scatter_add_(-1, column + PARTS[0] * row, agree[1] - agree[0])
@@ -317,12 +318,11 @@ def fits_a_crowd(pairs: Pairs, left: Tensor) -> Tensor:
 def agreement(pairs: Pairs, left: Tensor) -> Tensor:
     """Returns how much pixels agree with M motions that leave `[M, P, C, N]`, 0 to 1, `[M, P, N]`.
 
-    Pixels that a motion moves out of the picture tell nothing of it: they agree as with the first.
+    Pixels that the first moves out of the picture are no reason to leave it, and agree with none.
     """
     squared = left.square().sum(-2)
     scale = torch.stack([scale_of(each, pairs) for each in squared]).amin(0).square().unsqueeze(-1)
-    agree = 1 / (1 + squared / scale)
-    agree = torch.where(agree.isnan(), agree[0], agree).masked_fill(agree[0].isnan(), 0.0)
+    agree = (1 / (1 + squared / scale)).nan_to_num(0.0).masked_fill(squared[0].isnan(), 0.0)
     if not pairs.by_flow:  # no interpolated edge is a reason to leave the first
         agree[0] += 0.02
     return agree
