@@ -318,12 +318,14 @@ def fits_a_crowd(pairs: Pairs, left: Tensor) -> Tensor:
 def agreement(pairs: Pairs, left: Tensor) -> Tensor:
     """Returns how much pixels agree with M motions that leave `[M, P, C, N]`, 0 to 1, `[M, P, N]`.
 
-    Pixels that the first moves out of the picture are no reason to leave it, and agree with none.
+    By depth alone, neither an interpolated edge nor a pixel that the first motion moves out of the
+    picture is a reason to leave the first.
     """
     squared = left.square().sum(-2)
     scale = torch.stack([scale_of(each, pairs) for each in squared]).amin(0).square().unsqueeze(-1)
-    agree = (1 / (1 + squared / scale)).nan_to_num(0.0).masked_fill(squared[0].isnan(), 0.0)
-    if not pairs.by_flow:  # no interpolated edge is a reason to leave the first
+    agree = (1 / (1 + squared / scale)).nan_to_num(0.0)
+    if not pairs.by_flow:
+        agree = agree.masked_fill(squared[0].isnan(), 0.0)
         agree[0] += 0.02
     return agree
 

@@ -401,7 +401,7 @@ def _other_times(recorded: _Fit, raw_px: float) -> str:
     """Returns in which way successive maps of depth tell of another motion than flow, or ""."""
     of_depth = recorded.pairs._replace(by_flow=False, scale_px=0.5)
     still = EYE.expand_as(recorded.motion)
-    motion = best_motion(of_depth, recorded.motion, still)
+    motion = best_motion(of_depth, still, recorded.motion)  # at rest, no pixel leaves the picture
     px = median(apart(recorded.pairs, motion, recorded.motion))
     known = (recorded.motion, motion, recorded.pairs.motion)
     by_flow, after, by_poses = (px_of(residual(of_depth, each), 0.5) for each in known)

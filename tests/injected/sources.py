@@ -13,6 +13,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from tests.sequences.synthetic import SEVEN_SCENES
 
@@ -277,7 +278,9 @@ def doom(seed: int = 0) -> Shots | None:
     try:
         env = make_env("deadly_corridor")
         env.set_seed(seed)
-        frames = env.rollout(16)["next"]
+        with torch.random.fork_rng():
+            torch.manual_seed(seed)  # of the actions
+            frames = env.rollout(16)["next"]
         env.close()
     finally:
         os.chdir(here)
