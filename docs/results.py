@@ -102,8 +102,15 @@ def claims_table(claims: Sequence[Claim], p_name: str) -> str:
     return _table(header, rows)
 
 
-def recipes_table(primary: Sequence[Claim], earlier: Mapping[int, Mapping[str, str]]) -> str:
-    """Returns the verdicts on the primary claims with the recipe before and with this one."""
+def recipes_table(
+    primary: Sequence[Claim],
+    earlier: Mapping[int, Mapping[str, str]],
+    later: Mapping[str, Sequence[Run]],
+) -> str:
+    """Returns the verdicts on the primary claims with the recipe before and with this one.
+
+    The last column has the effects with a later recipe, in the scenes that have its runs.
+    """
     rows = []
     for claim in primary:
         of, contrast = earlier[claim.number], claim.contrasts[0]
@@ -111,8 +118,11 @@ def recipes_table(primary: Sequence[Claim], earlier: Mapping[int, Mapping[str, s
         before = f"{points(Estimate(value, low, high))}, p = {of['p']}", f"**{of['verdict']}**"
         verdict = claim.verdict.removesuffix(" with this recipe")
         now = effect_text(contrast), f"**{verdict}**"
-        rows.append((_label(claim, contrast), *before, *now))
-    return _table(("row", "before, p (Holm)", "verdict", "now, p (Holm)", "verdict"), rows)
+        found = contrast_of(contrast.asked, later, [*later]).effect
+        after = points(found.interval()) if found else ""
+        rows.append((_label(claim, contrast), *before, *now, after))
+    header = ("row", "before, p (Holm)", "verdict", "this page, p (Holm)", "verdict")
+    return _table((*header, "`laptop` today"), rows)
 
 
 def held_out_table(found: Sequence[HeldOut]) -> str:
@@ -494,7 +504,7 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
         .render(
             primary=claims_table(primary, "p (Holm)"),
             secondary=claims_table(secondary, "p"),
-            recipes=recipes_table(primary, earlier),
+            recipes=recipes_table(primary, earlier, studies["laptop"]),
             held_out=held_out_table(held_out_claims(declared, cells)) if cells else "",
             beside=beside_table(beside_held_out(declared, cells)) if cells else "",
             held_out_seeds=sorted({run.seed for cell in cells for run in cell.runs}),
