@@ -44,12 +44,15 @@ def test_the_gallery_shows_every_scene_and_make_gallery_makes_it():
     assert all(f"{kind}_{scene}.png" in gallery for kind in ("gallery", "plan") for scene in scenes)
 
 
-def test_the_readmes_agent_is_that_of_the_results():
+def test_the_readmes_agents_are_those_of_the_results_and_of_the_trained_agents_card():
     rows = README.read_text(encoding="utf-8").split("| pedestrians |")[1].splitlines()[2:5]
+    taught, demo = zip(*(line.split("|")[2:4] for line in rows))
     results = (README.parent / "docs" / "results.md").read_text(encoding="utf-8")
-    (road,) = re.findall(r"^### Straight Road\n(.*?)^###", results, re.DOTALL | re.MULTILINE)
-    (row,) = re.findall(r"^\|`\[ego,obj\]`\|.*", road, re.MULTILINE)
-    assert [line.split("|")[2].strip() for line in rows] == row.split("|")[2:5]
+    (row,) = re.findall(r"^\|.*`laptop` today\)\|`\[ego,obj\]`\|.*", results, re.MULTILINE)
+    assert [cell.strip() for cell in taught] == row.split("|")[4:7]
+    card = (README.parent / "flowrep" / "pretrained" / "README.md").read_text(encoding="utf-8")
+    (row,) = re.findall(r"^\| Straight Road \|.*", card, re.MULTILINE)
+    assert [cell.split()[0] for cell in demo] == [f"{float(c):.0f}" for c in row.split("|")[2:5]]
 
 
 def test_every_page_and_make_install_the_same_torch():
