@@ -20,7 +20,7 @@ from tests.config.composing import composed
 
 SCENES = sorted(group_choices("scene"))
 # of 20 episodes; one that never turns drives Straight Road in one of ten, the other scenes never
-LEAST = {"straight_road": 16, "s_turn": 12, "h_shaped_pathways": 16, "three_way_junction": 18}
+LEAST = {"straight_road": 16, "s_turn": 16, "h_shaped_pathways": 16, "three_way_junction": 18}
 
 
 TINY = {
