@@ -345,9 +345,12 @@ def test_a_protocol_stands_beside_the_other_with_its_own_verdict():
 def test_earlier_verdicts_stand_beside_those_of_this_recipe():
     (claim,), _ = claims(runs_with(both=(6, 7), raw=(2, 3)), HIGH)
     before = {"effect": "9", "low": "5", "high": "12", "p": "0.003", "verdict": "holds"}
-    row = results.recipes_table([claim], {1: before}).splitlines()[-1].replace("\u00a0", " ")
-    assert row.split("|")[2:4] == ["+9 [+5, +12], p = 0.003", "**holds**"]
-    assert row.split("|")[4].startswith("+50 [")
+    after = {"straight_road": runs_with(both=(4, 5), raw=(2, 3))}
+    table = results.recipes_table([claim], {1: before}, after).replace("\u00a0", " ")
+    cells = table.splitlines()[-1].split("|")
+    assert cells[2:4] == ["+9 [+5, +12], p = 0.003", "**holds**"]
+    assert cells[4].startswith("+50 [")
+    assert cells[6].startswith("+25 [")
 
 
 def test_pairs_of_runs_show_how_often_the_first_side_is_higher():
