@@ -31,6 +31,7 @@ class RandomActions:
     def __call__(self, env: StreetEnv) -> int:
         """Returns one of the three actions."""
         if not env.episode.steps:
+            # The 0 is a seed of no meaning now: without it, stored evaluations had other draws.
             self._rng = np.random.default_rng((env.episode.seed, 0))
         return int(self._rng.integers(3))
 
