@@ -105,24 +105,22 @@ def claims_table(claims: Sequence[Claim], p_name: str) -> str:
 def recipes_table(
     primary: Sequence[Claim],
     earlier: Mapping[int, Mapping[str, str]],
-    later: Mapping[str, Sequence[Run]],
+    later: Sequence[Claim],
 ) -> str:
-    """Returns the verdicts on the primary claims with the recipe before and with this one.
-
-    The last column has the effects with a later recipe, in the scenes that have its runs.
-    """
+    """Returns the verdicts on the primary claims with an earlier recipe, this one and a later."""
     rows = []
-    for claim in primary:
+    for claim, after in zip(primary, later):
         of, contrast = earlier[claim.number], claim.contrasts[0]
         value, low, high = (float(of[key]) / 100 for key in ("effect", "low", "high"))
         before = f"{points(Estimate(value, low, high))}, p = {of['p']}", f"**{of['verdict']}**"
-        verdict = claim.verdict.removesuffix(" with this recipe")
-        now = effect_text(contrast), f"**{verdict}**"
-        found = contrast_of(contrast.asked, later, [*later]).effect
-        after = points(found.interval()) if found else ""
-        rows.append((_label(claim, contrast), *before, *now, after))
+        rows.append((_label(claim, contrast), *before, *_verdict_on(claim), *_verdict_on(after)))
     header = ("row", "before, p (Holm)", "verdict", "this page, p (Holm)", "verdict")
-    return _table((*header, "`laptop` today"), rows)
+    return _table((*header, "`laptop` today, p (Holm)", "verdict"), rows)
+
+
+def _verdict_on(claim: Claim) -> tuple[str, str]:
+    verdict = claim.verdict.removesuffix(" with this recipe")
+    return effect_text(claim.contrasts[0]), f"**{verdict}**"
 
 
 def held_out_table(found: Sequence[HeldOut]) -> str:
@@ -386,18 +384,18 @@ def rate_table(runs: Sequence[Run]) -> str:
 def variation_table(titles: Mapping[str, str], studies: Studies) -> str:
     """Returns the success of each stack in further studies, with the speeds of training."""
 
-    def row(title: str, stack: str, runs: Sequence[Run]) -> Sequence[str]:
+    def row(title: str, scene: str, stack: str, runs: Sequence[Run]) -> Sequence[str]:
         trained_at = _speed_range(runs[0], runs[0].speed)
-        return (title, _stack(stack), trained_at, *_successes(runs), str(len(runs)))
+        return (title, SHORT[scene], _stack(stack), trained_at, *_successes(runs), str(len(runs)))
 
     rows = [
-        row(title, stack, runs)
+        row(title, scene, stack, runs)
         for study, title in titles.items()
-        for members in studies[study].values()
+        for scene, members in studies[study].items()
         for stack, runs in in_stacks(members).items()
     ]
     at = ("low, 0.6–1.0", "as trained", "high, 2.0–2.4")
-    return _table(("", "", "trained at, m/s", *at, "runs"), rows)
+    return _table(("", "", "", "trained at, m/s", *at, "runs"), rows)
 
 
 def _speed_range(run: Run, speed: str) -> str:
@@ -480,10 +478,10 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
     """Returns the page and its figures by file."""
     studies = studies_of(declared, runs)
     primary, secondary = claims_of(declared, studies)
-    # the second protocol has runs in some scenes only
-    of_wide = {**declared, "scenes": [*studies["wide_speeds"]]}
-    wide, _ = claims_of(of_wide, studies, "wide_speeds")
     main, forks = studies["main"], declared["forks"]
+
+    def in_its_scenes(study: str) -> list[Claim]:
+        return claims_of({**declared, "scenes": [*studies[study]]}, studies, study)[0]
 
     def beside(study: str, second: str, weights: Mapping[Any, int]) -> str:
         asked = {"first": "ego+obj", "second": second, "expect": "more", "success": weights}
@@ -504,7 +502,7 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
         .render(
             primary=claims_table(primary, "p (Holm)"),
             secondary=claims_table(secondary, "p"),
-            recipes=recipes_table(primary, earlier, studies["laptop"]),
+            recipes=recipes_table(primary, earlier, in_its_scenes("laptop")),
             held_out=held_out_table(held_out_claims(declared, cells)) if cells else "",
             beside=beside_table(beside_held_out(declared, cells)) if cells else "",
             held_out_seeds=sorted({run.seed for cell in cells for run in cell.runs}),
@@ -513,7 +511,7 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
             # row 14 against the paper's other stack of two frames, row 19 at each speed alone
             against_depth=beside("frame_rate", "depth2", {12: 1, 6: -1}),
             alone={speed: beside("wide_confirmation", "raw", {speed: 1}) for speed in SPEEDS},
-            wide=protocols_table(primary, wide, "straight_road"),
+            wide=protocols_table(primary, in_its_scenes("wide_speeds"), "straight_road"),
             figure=FIGURE,
             scenes={words(scene): scene_table(of, scene in forks) for scene, of in main.items()},
             missed=missed_ways(run for run in every if run.scene in forks),

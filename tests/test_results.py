@@ -342,15 +342,15 @@ def test_a_protocol_stands_beside_the_other_with_its_own_verdict():
     assert row.replace("\u00a0", " ") == f"|{'|'.join(cells)}|**contradicted**|"
 
 
-def test_earlier_verdicts_stand_beside_those_of_this_recipe():
+def test_verdicts_of_three_recipes_stand_side_by_side():
     (claim,), _ = claims(runs_with(both=(6, 7), raw=(2, 3)), HIGH)
+    (after,), _ = claims(runs_with(both=(2, 3), raw=(6, 7)), HIGH)
     before = {"effect": "9", "low": "5", "high": "12", "p": "0.003", "verdict": "holds"}
-    after = {"straight_road": runs_with(both=(4, 5), raw=(2, 3))}
-    table = results.recipes_table([claim], {1: before}, after).replace("\u00a0", " ")
-    cells = table.splitlines()[-1].split("|")
-    assert cells[2:4] == ["+9 [+5, +12], p = 0.003", "**holds**"]
-    assert cells[4].startswith("+50 [")
-    assert cells[6].startswith("+25 [")
+    table = results.recipes_table([claim], {1: before}, [after]).replace("\u00a0", " ")
+    cells = table.splitlines()[-1].split("|")[2:-1]
+    assert cells[0] == "+9 [+5, +12], p = 0.003"
+    assert [cells[place].split(" [")[0] for place in (2, 4)] == ["+50", "−50"]
+    assert cells[1::2] == ["**holds**", "**holds**", "**contradicted**"]
 
 
 def test_pairs_of_runs_show_how_often_the_first_side_is_higher():
