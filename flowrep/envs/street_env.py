@@ -117,7 +117,10 @@ class StreetEnv(gym.Env):
         if "state" in options:
             if others := sorted(options.keys() - {"state"}):
                 raise ValueError(f"reset options {others} can't be combined with state")
-            self._resume(options["state"])
+            try:
+                self._resume(options["state"])
+            except (KeyError, TypeError) as error:
+                raise ValueError(f"the state is none that get_state returned: {error!r}") from error
         else:
             self._begin({"episode_seed": int(self.np_random.integers(1 << 31))} | options)
 
@@ -226,10 +229,10 @@ def checked_frame_rate(scene: Scene, frame_rate_hz: float | None) -> float:
 
 
 def _number(value: Any) -> float:
-    """Returns a number as a float, nan for anything else."""
+    """Returns a number as a float, nan for anything else; a number in quotes is a mistake."""
     # Not from geometry.checks, since workers step envs without PyTorch.
     try:
-        return float(value)
+        return math.nan if isinstance(value, str) else float(value)
     except (TypeError, ValueError):
         return math.nan
 
