@@ -221,7 +221,7 @@ def beside_held_out(
     }
     measured |= {
         "as in training": (cells, trained),
-        "loss from training to held out": (cells, lost),
+        "extra loss from training to held out": (cells, lost),
         "the paper's training, 1.2–1.8": (cells, other),
     }
     return [

@@ -114,8 +114,8 @@ def recipes_table(
         value, low, high = (float(of[key]) / 100 for key in ("effect", "low", "high"))
         before = f"{points(Estimate(value, low, high))}, p = {of['p']}", f"**{of['verdict']}**"
         rows.append((_label(claim, contrast), *before, *_verdict_on(claim), *_verdict_on(after)))
-    header = ("row", "before, p (Holm)", "verdict", "this page, p (Holm)", "verdict")
-    return _table((*header, "`laptop` today, p (Holm)", "verdict"), rows)
+    header = [x for number in (1, 2, 3) for x in (f"recipe {number}, p (Holm)", "verdict")]
+    return _table(("row", *header), rows)
 
 
 def _verdict_on(claim: Claim) -> tuple[str, str]:
@@ -163,6 +163,18 @@ def cell_table(cell: Cell) -> str:
     percents = ["" if share is None else f"{100 * share:.0f}" for share in blind]
     rows.append(["a planner blind to speed", *percents, ""])
     return _table([*header, "each run, held out"], rows)
+
+
+def above_the_planner(cells: Sequence[Cell]) -> list[str]:
+    """Returns in how many cells each stack is above the planner that is blind to speed."""
+    counts = Counter[str]()
+    for cell in cells:
+        (condition,) = conditions_of(cell.runs[0], [cell.mode])
+        blind = baseline_share(cell.runs, condition._replace(policy="speed_blind"))
+        for stack, runs in in_stacks(cell.runs).items():
+            found = cell_of(runs, condition)
+            counts[stack] += bool(found and blind is not None and found.score.value > blind)
+    return [f"{_stack(stack)} in {count}" for stack, count in counts.items()]
 
 
 def draw_held_out(cells: Sequence[Cell]) -> Figure:
@@ -503,8 +515,11 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
             primary=claims_table(primary, "p (Holm)"),
             secondary=claims_table(secondary, "p"),
             recipes=recipes_table(primary, earlier, in_its_scenes("laptop")),
+            later_scenes=[words(scene) for scene in studies["laptop"]],
             held_out=held_out_table(held_out_claims(declared, cells)) if cells else "",
             beside=beside_table(beside_held_out(declared, cells)) if cells else "",
+            held_out_runs=sum(len(cell.runs) for cell in cells),
+            above=above_the_planner(cells),
             held_out_seeds=sorted({run.seed for cell in cells for run in cell.runs}),
             cells={cell.title: cell_table(cell) for cell in cells},
             held_out_figure=HELD_OUT_FIGURE,

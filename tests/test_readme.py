@@ -48,11 +48,20 @@ def test_the_readmes_agents_are_those_of_the_results_and_of_the_trained_agents_c
     rows = README.read_text(encoding="utf-8").split("| pedestrians |")[1].splitlines()[2:5]
     taught, demo = zip(*(line.split("|")[2:4] for line in rows))
     results = (README.parent / "docs" / "results.md").read_text(encoding="utf-8")
-    (row,) = re.findall(r"^\|.*`laptop` today\)\|`\[ego,obj\]`\|.*", results, re.MULTILINE)
-    assert [cell.strip() for cell in taught] == row.split("|")[4:7]
+    (row,) = re.findall(r"^\|recipe 3 .*\|SR\|`\[ego,obj\]`\|.*", results, re.MULTILINE)
+    assert [cell.strip() for cell in taught] == row.split("|")[5:8]
     card = (README.parent / "flowrep" / "pretrained" / "README.md").read_text(encoding="utf-8")
     (row,) = re.findall(r"^\| Straight Road \|.*", card, re.MULTILINE)
     assert [cell.split()[0] for cell in demo] == [f"{float(c):.0f}" for c in row.split("|")[2:5]]
+
+
+def test_the_readmes_count_of_verdicts_is_that_of_the_results():
+    text = README.read_text(encoding="utf-8")
+    results = (README.parent / "docs" / "results.md").read_text(encoding="utf-8")
+    verdicts = re.findall(r"^\|[1-8]\|.*?\*\*(\w+)[^|]*\*\*\|", results, re.MULTILINE)
+    counted = [verdicts.count(word) for word in ("holds", "contradicted", "not")]
+    assert counted == [2, 1, 5]
+    assert "two hold, one is contradicted and five are not seen" in text
 
 
 def test_every_page_and_make_install_the_same_torch():

@@ -245,6 +245,17 @@ def test_the_page_begins_with_held_out_speeds(packed):
     assert {*figures} == {results.FIGURE, results.HELD_OUT_FIGURE}
 
 
+def test_the_page_counts_where_a_stack_is_above_the_planner_that_is_blind_to_speed():
+    text = results.PAGE.read_text(encoding="utf-8")
+    (counts,) = re.findall(r"these are above it: (.*) of the 4 panels", text)
+    details = text.split("## Held-out speeds in numbers")[1].split("\n## ")[0]
+    blind = [int(share) for share in re.findall(r"planner blind to speed\|(\d+)\|", details)]
+    for stack, count in re.findall(r"(`\S+`) in (\d)", counts):
+        shares = re.findall(rf"\|{re.escape(stack)}\|(\d+) \[", details)
+        assert len(shares) == len(blind) == 4
+        assert sum(int(share) > line for share, line in zip(shares, blind)) == int(count)
+
+
 def test_a_split_shows_held_out_speeds_first_and_its_figure_has_a_panel_each():
     cells = held_out_cells(HELD_OUT, held_out_runs({"ego+obj": (6, 7), "raw": (2, 3)}))
     header, _, raw, flow, blind = results.cell_table(cells[1]).splitlines()
