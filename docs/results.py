@@ -107,7 +107,7 @@ def recipes_table(
     earlier: Mapping[int, Mapping[str, str]],
     later: Sequence[Claim],
 ) -> str:
-    """Returns the verdicts on the primary claims with an earlier recipe, this one and a later."""
+    """Returns the verdicts on the primary claims with recipes 1, 2 and 3."""
     rows = []
     for claim, after in zip(primary, later):
         of, contrast = earlier[claim.number], claim.contrasts[0]

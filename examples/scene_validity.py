@@ -7,7 +7,6 @@ import argparse
 import time
 from collections import Counter
 
-from flowrep.baselines import BASELINES
 from flowrep.envs import make_env
 from flowrep.experiment.evaluation import evaluate
 from flowrep.experiment.outcomes import OUTCOMES, wilson_interval
@@ -20,7 +19,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", nargs="+", default=scene_names())
     parser.add_argument("--episodes", type=int, default=500)
-    parser.add_argument("--baselines", nargs="+", default=list(BASELINES), choices=list(BASELINES))
+    parser.add_argument("--baselines", nargs="+", default=list(BOUNDS), choices=list(BOUNDS))
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     print(

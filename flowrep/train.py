@@ -120,8 +120,8 @@ def announce(config: TrainConfig, preset: str) -> None:
     print(f"device: {device.type} ({where}{cores})")
     if preset == "paper" and device.type == "cpu" and config.total_frames >= 1_000_000:
         print(
-            f"{config.total_frames:,} frames with the paper's settings take one to two days on two "
-            "cores; preset=laptop takes minutes"
+            f"{config.total_frames:,} frames with the paper's settings take two to four days; "
+            "preset=laptop takes minutes"
         )
 
 
