@@ -216,10 +216,10 @@ def test_the_package_has_it_by_name():
 # The agents that come with flowrep: that they load, see what they were trained on, and drive.
 
 
-def test_every_scene_has_one_of_at_most_two_megabytes():
+def test_every_scene_has_one_of_at_most_three_megabytes():
     sizes = {path.stem: path.stat().st_size for path in PRETRAINED.glob("*.safetensors")}
     assert sorted(sizes) == SCENES
-    assert max(sizes.values()) <= 2_000_000
+    assert max(sizes.values()) <= 3_000_000  # 1.7 MB for two maps of 60 × 60, 2.6 MB for three
 
 
 def test_rows_keep_their_largest_weight_exactly_and_others_to_half_a_step():
