@@ -94,8 +94,9 @@ class AdaptPose(MapTransform):
     | a pose | `("sensor", "world_from_cam")` | float64 `[*B, 4, 4]` | rigid | m |
 
     Convention and further arguments: see `flowrep.geometry.adapt_pose`. It also converts poses of
-    bodies, e.g. `[*B, N, 7]`, with `axes="opencv"`, since the axes of a body do not matter. In a
-    left-handed world (`"unreal"`, `"unity"`) give the camera's axes, which convert the world too.
+    bodies, e.g. `[*B, N, 7]`, with `axes="opencv"`, since the axes of a body do not matter; a body
+    whose numbers are all `nan` is absent. In a left-handed world (`"unreal"`, `"unity"`) give the
+    camera's axes, which convert the world too.
 
     Args:
         check: whether to check that poses are rigid, at resets (of the envs that are reset) and at
@@ -140,7 +141,17 @@ class AdaptPose(MapTransform):
         if not self.check or tensordict.get(self.in_keys[0], None) is None:
             return
         (pose,) = self._inputs(tensordict)
-        geometry.adapt_pose(pose if rows is None else pose[rows], check=True, **self.options)
+        own_dims = len(self.reads[0].shape)
+        are_bodies = pose.ndim > tensordict.ndim + own_dims
+        pose = pose if rows is None else pose[rows]
+        if are_bodies:
+            is_absent = pose.flatten(-own_dims).isnan().all(-1)
+            if is_absent.all():
+                return
+            # in place of the absent ones, so that an error names the right row
+            mask = is_absent.reshape(*is_absent.shape, *[1] * own_dims)
+            pose = torch.where(mask, pose[~is_absent][0], pose)
+        geometry.adapt_pose(pose, check=True, **self.options)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase

@@ -87,6 +87,22 @@ def test_poses_of_several_bodies_at_once():
         T.AdaptPose(layout="xyz_wxyz", in_keys="matrices")(TensorDict({"matrices": matrices}, [2]))
 
 
+@pytest.mark.parametrize("layout", ["matrix", "xyz_wxyz"])
+def test_a_body_may_be_absent_but_a_camera_may_not(layout):
+    good = torch.eye(4) if layout == "matrix" else torch.tensor([5.0, 6, 7, 1, 0, 0, 0])
+    absent = torch.full_like(good, math.nan)
+    adapt = T.AdaptPose(layout=layout)
+    bodies = torch.stack([absent, good, good])[None]
+    td = TensorDict({"pose": bodies}, [1])
+    assert adapt(td.clone())[POSE].isnan().any(-1).any(-1).tolist() == [[True, False, False]]
+    assert POSE in adapt._reset(td, TensorDict({"pose": absent.expand_as(bodies)}, [1])).keys(True)
+    bodies[0, 2].view(-1)[0] = math.nan  # a part of a pose is unknown
+    with pytest.raises(ValueError, match=r"pose\[0, 2\]"):
+        adapt(td.clone())
+    with pytest.raises(ValueError, match="pose"):
+        adapt(TensorDict({"pose": absent[None]}, [1]))
+
+
 def test_a_simulator_that_knows_poses_alone_gets_the_flow_of_one_that_knows_motions():
     keys = [("sensor", "depth"), ("sensor", "instance"), "motions"]
     own = Compose(
