@@ -47,8 +47,8 @@ class CameraTransform(MapTransform):
     last input keys are that of K, `[*B, 3, 3]`, and, if given, that of the previous frame's K. If
     the first input is raw flow, it becomes nan where the mask under `mask_key` is False.
 
-    Values of K are checked when they change; on a GPU, where the check has to wait for them, in one
-    call of a hundred. An unknown K (nan, inf or a focal length of 0) makes its frame invalid.
+    Values of K are checked when they change; on a GPU, where the check has to wait for them, in two
+    calls of a hundred. An unknown K (nan, inf or a focal length of 0) makes its frame invalid.
 
     Raises:
         ValueError: K doesn't fit the maps' size, see `check_intrinsics`; or K changes within an
