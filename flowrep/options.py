@@ -122,6 +122,15 @@ class DoubleDQNOptions(OffPolicyOptions):
     final_epsilon: Share = 0.05  # ε after `exploration_share` of the frames
     exploration_share: Share = 0.2
 
+    @model_validator(mode="after")
+    def _epsilon_falls(self) -> DoubleDQNOptions:
+        if self.initial_epsilon < self.final_epsilon:
+            raise ValueError(
+                f"initial_epsilon={self.initial_epsilon} is less than "
+                f"final_epsilon={self.final_epsilon}, but ε only falls"
+            )
+        return self
+
 
 class PPOOptions(LearnerOptions):
     """Options of `algorithm=ppo`."""
@@ -131,7 +140,7 @@ class PPOOptions(LearnerOptions):
     epochs: Count = 4  # passes over these steps in a round
     gae_lambda: Share = 0.95  # GAE's λ, from 0 (relies on V) to 1 (relies on the rewards)
     clip: PositiveShare = 0.2  # moving ρ farther than this from 1 gains nothing
-    value_weight: NotNegative = 0.5  # of L_V
+    value_weight: Positive = 0.5  # of L_V
     entropy_weight: NotNegative = 0.01  # of L_H
     max_grad_norm: Positive = 0.5  # of all gradients together, which are scaled down to it
 

@@ -63,7 +63,8 @@ class StopRequest:
 
     The first signal sets `received` and calls `then`. A second Ctrl-C ends the process at once; a
     second SIGTERM doesn't, since schedulers send it to each process of a job and more than once.
-    If SIGHUP is ignored, as under `nohup`, it stays so. The previous handlers are restored when the
+    If SIGHUP is ignored, as under `nohup`, it stays so. In another thread than the main one it does
+    nothing. The previous handlers are restored when the
     context ends.
     """
 
@@ -84,6 +85,8 @@ class StopRequest:
         return self.received is not None
 
     def __enter__(self) -> "StopRequest":
+        if threading.current_thread() is not threading.main_thread():
+            return self  # signals reach the main thread alone
         for number in STOP_SIGNALS:
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
                 self._previous[number] = signal.signal(number, self._receive)

@@ -47,8 +47,11 @@ def run(config: ViewConfig) -> None:
     from flowrep.experiment.film import Film
     from flowrep.experiment.window import Keyboard, drive_by_hand
 
-    is_scene_given = any(text.startswith("scene") for text in HydraConfig.get().overrides.task)
-    agent = agent_of(config, is_scene_given)
+    keys = [text.partition("=")[0].lstrip("+") for text in HydraConfig.get().overrides.task]
+    changed = [key for key in keys if key.startswith("scene.")]
+    if keeps_scene(config, "scene" in keys) and changed:
+        raise UsageError(f"{changed[0]}= changes a scene: add scene=, which names it")
+    agent = agent_of(config, "scene" in keys)
     with closing(Film(agent, **street_of(config))) as film:
         options = episodes_of(config, film.street.scene)
         if config.interactive:
@@ -57,15 +60,19 @@ def run(config: ViewConfig) -> None:
             view(config, agent, film, options, folder_of(config, film.street.scene))
 
 
+def keeps_scene(config: ViewConfig, is_scene_given: bool) -> bool:
+    """Returns whether a trained agent drives in the scene of its training."""
+    is_trained = policy_kind(config.policy) in ("run", "saved") and config.policy != "pretrained"
+    return is_trained and not is_scene_given
+
+
 def agent_of(config: ViewConfig, is_scene_given: bool) -> Agent:
     """Returns what drives: a trained agent in the scene of its training, unless one was given."""
     from flowrep.experiment.agents import Agent
 
-    is_trained = policy_kind(config.policy) in ("run", "saved") and config.policy != "pretrained"
-    keeps_scene = is_trained and not is_scene_given
     return Agent.load(
         config.policy,
-        scene=None if keeps_scene else config.scene,
+        scene=None if keeps_scene(config, is_scene_given) else config.scene,
         representations=config.representations,
         trusted=config.trusted,
         device="cpu",

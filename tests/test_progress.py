@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 import termios
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -188,3 +189,13 @@ def test_a_closed_terminal_stops_as_sigterm_does_and_printing_to_it_is_no_error(
     os.close(end)
     assert process.wait(timeout=60) == 0
     assert saved.read_text() == str(128 + signal.SIGHUP)
+
+
+def test_in_another_thread_nothing_is_caught():
+    with ThreadPoolExecutor() as pool:
+        assert pool.submit(_enters_and_leaves).result()
+
+
+def _enters_and_leaves():
+    with StopRequest() as stop:
+        return not stop

@@ -102,14 +102,15 @@ class DoubleDQN(OffPolicy):
         """See `Algorithm.make_policy`; the policy's state includes ε."""
         run: Any = {"total_frames": total_frames, "device": device}
         stochastic = super().make_policy(observation_spec, action_spec, keys, options, **run)
+        actions = DiscreteActions.from_spec(action_spec)
         exploration = EGreedyModule(
-            action_spec,
+            # without the batch of envs, so that any batch may act
+            type(action_spec)(actions.count, dtype=action_spec.dtype, device=device),
             options.initial_epsilon,
             options.final_epsilon,
             max(1, int(options.exploration_share * total_frames)),
             device=device,
         )
-        actions = DiscreteActions.from_spec(action_spec)
         return EpsilonGreedyPolicy(stochastic[0].module, list(keys), actions, exploration)
 
     def remember(self, steps: TensorDictBase) -> None:

@@ -15,16 +15,19 @@ import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
+from contextlib import contextmanager
 from hashlib import sha1
 from pathlib import Path
 from typing import Any, NoReturn
 
 import hydra
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.core.utils import env_override
 from hydra.errors import HydraException, MissingConfigException
+from hydra.initialize import get_gh_backup, restore_gh_from_backup
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from yaml import YAMLError
@@ -85,16 +88,29 @@ def composed(
     typed = list(_overrides(values))
     register_resolvers()
     try:
-        with hydra.initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+        with _own_hydra(), hydra.initialize_config_dir(str(CONF_DIR), version_base="1.3"):
             config = hydra.compose(config_name, typed, return_hydra_config=True)
         return checked(config, schema), str(config.hydra.run.dir), typed
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise UsageError(explained(error, schema)) from None
 
 
+@contextmanager
+def _own_hydra() -> Iterator[None]:
+    """Sets Hydra's global state aside, which the script that calls may use itself."""
+    outer = get_gh_backup()
+    GlobalHydra.instance().clear()
+    try:
+        yield
+    finally:
+        restore_gh_from_backup(outer)
+
+
 def _overrides(values: Mapping[str, Any], section: str = "") -> Iterator[str]:
     for key, value in values.items():
         if isinstance(value, Mapping):
+            if f"{section}{key}" == "representations":  # these and no others
+                yield f"representations=[{','.join(value)}]"
             yield from _overrides(value, f"{section}{key}.")
         elif isinstance(value, str | Path):
             yield override(f"{section}{key}", str(value))

@@ -253,11 +253,12 @@ class TrainConfig(EnvConfig):
                 f"algorithm.{key}={value}: the first update would come after {frames} frames, "
                 f"and total_frames is {self.total_frames}: raise it, or lower algorithm.{key}"
             )
-        least = 2 * self.num_envs  # a step of all envs, and the one before
+        # a transition of all envs, and the step after it
+        least = (1 + getattr(self.algorithm, "n_steps", 1)) * self.num_envs
         capacity = getattr(self.algorithm, "replay_capacity", least)
         if capacity < least:
             raise ValueError(
-                f"algorithm.replay_capacity={capacity} can't hold two steps of "
+                f"algorithm.replay_capacity={capacity} can't hold a transition of "
                 f"num_envs={self.num_envs}: give at least {least}, or fewer envs"
             )
         return self

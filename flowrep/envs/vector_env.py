@@ -77,7 +77,7 @@ class StreetVectorEnv(SyncVectorEnv):
         options = dict(options or {})
         mask = options.pop("reset_mask", np.ones(self.num_envs, dtype=bool))
         episodes = options.pop("episodes", None) or [{}] * self.num_envs
-        seeds = range(seed, seed + self.num_envs) if isinstance(seed, int) else seed
+        seeds = range(seed, seed + self.num_envs) if isinstance(seed, int | np.integer) else seed
         due = np.flatnonzero(mask).tolist()
         for i in due:
             self._is_idle[i] = episodes[i] is None

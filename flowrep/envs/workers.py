@@ -129,7 +129,7 @@ class WorkerVectorEnv(VectorEnv):
         """
         shared = {"reset_mask": np.ones(self.num_envs, dtype=bool), **(options or {})}
         split = [name for name in ("reset_mask", "episodes") if shared.get(name) is not None]
-        if isinstance(seed, int):
+        if isinstance(seed, int | np.integer):
             seed = range(seed, seed + self.num_envs)
         seeds = [None] * self.num_envs if seed is None else list(seed)
 

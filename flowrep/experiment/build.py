@@ -51,8 +51,9 @@ def env(config: EnvConfig, **changes: Any) -> EnvBase:
         "renderer": config.renderer,
     }
     arguments |= changes | {"num_workers": num_workers}
-    maps: Mapping[str, Any] = arguments["representations"]
-    arguments["representations"] = {name: _options(name, maps[name]) for name in maps}
+    maps = arguments["representations"]
+    if isinstance(maps, Mapping):
+        arguments["representations"] = {name: _options(name, maps[name]) for name in maps}
     return make_env(**arguments).append_transform(InitTracker())
 
 

@@ -271,7 +271,8 @@ class PairedEvaluation:
     ) -> Iterator[EpisodeRecord]:
         """Yields the missing episodes."""
         for rate in self.fps:
-            for names, changes in ((self.policies, {}), (self.baselines, _BLIND)):
+            own = _BLIND if isinstance(policy, str) else {}  # a baseline, too
+            for names, changes in ((self.policies, own), (self.baselines, _BLIND)):
                 jobs = {name: self._job(name, policy, rate) for name in names}
                 most = max((len(job["episodes"]) for job in jobs.values()), default=0)
                 if stop or not most:

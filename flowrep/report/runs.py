@@ -65,13 +65,22 @@ class Run:
 
     @cached_property
     def tested(self) -> NDArray[np.bool_]:
-        """Which episodes the finished agent drove in the scene of its training."""
+        """Which episodes the finished agent drove in the scene of its training, each one once."""
         e = self.episodes
         here = e["scene"] == self.scene
         while_training = e["scene_id"][here & (e["evaluation"] != "evaluate")]
         if len(while_training):  # the scene may have changed since, under the same name
             here &= e["scene_id"] == while_training[0]
-        return here & (e["evaluation"] != "training") & (e["frames"] >= self.total_frames)
+        here &= (e["evaluation"] != "training") & (e["frames"] >= self.total_frames)
+        latest = np.flatnonzero(here)
+        latest = latest[np.argsort(-e["frames"][latest], kind="stable")]
+        cells = (e[name][latest].tolist() for name in (*Condition._fields, "episode_seed"))
+        once: dict[Any, int] = {}
+        for row, episode in zip(latest.tolist(), zip(*cells)):
+            once.setdefault(episode, row)
+        here[:] = False
+        here[[*once.values()]] = True
+        return here
 
     @cached_property
     def conditions(self) -> set[Condition]:

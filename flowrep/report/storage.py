@@ -13,6 +13,7 @@ import gzip
 import io
 import json
 import sys
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from fnmatch import fnmatch
@@ -171,6 +172,9 @@ def write_archive(runs: Sequence[Run], folder: Path) -> None:
 
     The same runs give the same bytes.
     """
+    names = Counter(Path(run.name).name for run in runs)
+    if repeated := [name for name, count in names.items() if count > 1]:
+        raise RunFolderError(f"two runs are named {repeated[0]}: pack one of them, or rename it")
     folder.mkdir(parents=True, exist_ok=True)
     before = read_archive(folder) if is_archive(folder) else []
     kept = dict(sorted({Path(run.name).name: run for run in (*before, *runs)}.items()))
@@ -211,11 +215,11 @@ def main() -> None:
     asked = parser.parse_args()
     try:
         runs, warnings = read_runs(asked.folders)
-    except ValueError as error:
+        for warning in warnings:
+            print(f"left out: {warning}")
+        write_archive(runs, asked.into)
+    except (OSError, ValueError) as error:
         sys.exit(f"error: {error}")
-    for warning in warnings:
-        print(f"left out: {warning}")
-    write_archive(runs, asked.into)
     print(f"{asked.into}: {len(runs)} runs packed")
 
 

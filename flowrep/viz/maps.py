@@ -171,7 +171,7 @@ def stock_tiles(
         "ego": "The part of it that the camera's own motion causes.",
         "obj": "The rest: what moves by itself.",
     }
-    for name, scale_px in flow_scale_px.items():
+    for name, scale_px in {**FLOW_SCALE_PX, **flow_scale_px}.items():
         draw = partial(flow_to_rgb, scale_px=scale_px)
         note = flow_note(scale_px)
         tiles[name] = Tile(f"{name} flow", draw, note, about.get(name, ""), is_flow=True)
@@ -360,7 +360,10 @@ def _listed(names: str | Iterable[str]) -> tuple[str, ...]:
 
 
 def _picture(rgb: Any) -> Image:
-    return np.moveaxis(_channels("rgb", rgb, 3), 0, -1).astype(np.uint8)
+    picture = np.moveaxis(_channels("rgb", rgb, 3), 0, -1)
+    if picture.dtype.kind == "f":
+        raise ValueError(f"rgb must be uint8, 0 to 255, got {picture.dtype}")
+    return picture.astype(np.uint8)
 
 
 def _channels(name: str, values: Any, channels: int) -> NDArray[Any]:

@@ -41,7 +41,9 @@ class Video:
         self._messages: Any = None
 
     def append(self, image: Image) -> None:
-        """Adds a frame `[H, W, 3]`."""
+        """Adds a frame `[H, W, 3]` of uint8."""
+        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[-1] != 3:
+            raise ValueError(f"a frame is [H, W, 3] uint8, got {[*image.shape]} {image.dtype}")
         if self._ffmpeg is None:
             self._start((image.shape[0] + 1) // 2 * 2, (image.shape[1] + 1) // 2 * 2)
         height, width = self._size

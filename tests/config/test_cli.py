@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 import flowrep
-from flowrep.config import CONF_DIR, cli, schema
+from flowrep.config import CONF_DIR, UsageError, cli, schema
 from tests.running import run_python
 
 SCHEMAS = {
@@ -324,3 +325,23 @@ def test_a_command_ends_with_one_line_and_code_2(tmp_path):
     assert result.stderr.startswith("error: ")
     assert "nowhere" in result.stderr
     assert not (tmp_path / "nowhere").exists()
+
+
+@pytest.mark.parametrize("group", ["experiment", "debug"])
+def test_a_misspelt_choice_of_an_optional_group_is_refused(group):
+    with pytest.raises(UsageError, match=f"unknown {group} 'smok'"):
+        cli.composed("train", {group: "smok"}, schema.TrainConfig)
+
+
+def test_a_mapping_of_representations_is_the_whole_stack():
+    values = {"debug": "smoke", "representations": {"obj": {"scale": 0.5}}}
+    config, _, _ = cli.composed("train", values, schema.TrainConfig)
+    assert {name: of["scale"] for name, of in config.representations.items()} == {"obj": 0.5}
+
+
+def test_a_config_can_be_composed_in_a_script_that_uses_hydra_itself(tmp_path):
+    with initialize_config_dir(str(tmp_path), version_base="1.3"):
+        config, _, _ = cli.composed("train", {"debug": "smoke"}, schema.TrainConfig)
+        assert config.total_frames > 0
+        assert GlobalHydra.instance().is_initialized()
+    assert not GlobalHydra.instance().is_initialized()

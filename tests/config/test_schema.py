@@ -195,3 +195,16 @@ def test_a_scene_that_is_none_is_refused_by_its_key(scene, says):
         validated(TrainConfig, plain("train") | {"scene": scene})
     assert str(caught.value).startswith(says)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("algorithm=dqn algorithm.initial_epsilon=0.04", "initial_epsilon=0.04 is less than"),
+        ("algorithm=ppo algorithm.value_weight=0", "algorithm.value_weight"),
+        ("algorithm.n_steps=10 algorithm.replay_capacity=8", "replay_capacity=8.*at least 44"),
+    ],
+)
+def test_options_with_which_an_agent_could_not_learn_are_refused(line, message):
+    with pytest.raises(UsageError, match=message):
+        validated(TrainConfig, plain("train", "debug=smoke", *line.split()))

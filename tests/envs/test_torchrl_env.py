@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -247,7 +248,7 @@ def test_workers_give_what_one_process_gives(make):
     alone, _ = play(make(**arguments, seed=7), actions)
     env = make(**arguments, seed=7, num_workers=2)
     check_env_specs(env)
-    env.set_seed(7)
+    env.set_seed(np.int64(7))  # numpy's numbers are numbers, too
     shared, _ = play(env, actions)
     assert alone["next", "done"].any()
     assert differing(alone, shared) == []

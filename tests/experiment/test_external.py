@@ -242,3 +242,13 @@ def test_a_damaged_card_is_named(text, tmp_path):
     (tmp_path / "agent.json").write_text(text)
     with pytest.raises(PolicyError, match=r"agent\.pt2"):
         check_card(f"{tmp_path}/agent.pt2", task())
+
+
+def test_a_policy_that_changes_its_maps_changes_nothing_of_the_envs():
+    def spoil(maps):
+        maps["depth"].zero_()
+        return [0, 0]
+
+    seen = maps().apply(torch.clone)
+    ExternalPolicy("mine", spoil, TASK)(seen)
+    assert (seen["depth"] > 0).all()

@@ -70,3 +70,10 @@ def test_many_keys_that_differ_make_a_short_label(tmp_path):
     run_in(tmp_path, "b", **changes, flow__source="estimated")
     (long,) = [label for label in labels(tmp_path) if "estimated" in label]
     assert long.endswith(", 2 more keys")
+
+
+def test_an_episode_that_was_evaluated_twice_counts_once(tmp_path):
+    config = config_of()
+    rows = rows_of(config, "ssc", evaluation="final") + rows_of(config, "sscc")
+    run = read_run(write_run(tmp_path / "run", config, rows))
+    assert sorted(run.episodes["episode_seed"][run.tested].tolist()) == [100, 101, 102, 103]

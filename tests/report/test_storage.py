@@ -165,3 +165,10 @@ def test_a_packed_run_with_an_unknown_outcome_is_named(tmp_path):
     write_archive([run], tmp_path / "packed")
     with pytest.raises(RunFolderError, match=r"run a: .*'won'"):
         read_runs([tmp_path / "packed"])
+
+
+def test_two_runs_of_one_name_are_not_packed_into_one(tmp_path):
+    runs = [read_run(run_in(tmp_path / sweep, "s0", 6)) for sweep in ("a", "b")]
+    with pytest.raises(RunFolderError, match="two runs are named s0"):
+        write_archive(runs, tmp_path / "packed")
+    assert not (tmp_path / "packed").exists()

@@ -184,6 +184,10 @@ def test_the_bar_of_depth_has_the_colours_of_depth_from_near_to_far():
         (lambda: viz.flow_to_rgb(np.zeros((3, 4, 2)), 1.0), r"must be \[2, H, W\].*\[3, 4, 2\]"),
         (lambda: viz.flow_to_rgb(flow_of(0, 0), 0.0), "scale_px must be positive"),
         (lambda: viz.depth_to_rgb(np.zeros((4, 4))), r"depth must be \[1, H, W\]"),
+        (
+            lambda: viz.representation_strip({"rgb": np.zeros((3, 4, 4))}),
+            "rgb must be uint8.*float",
+        ),
         (lambda: viz.representation_strip({"eggo": np.zeros(1)}), "eggo.*expected some of.*'ego'"),
         (lambda: viz.strip({"a": np.zeros((2, 3, 3)), "b": np.zeros((3, 2, 3))}), "needs images"),
     ],
@@ -217,3 +221,9 @@ def test_importing_viz_needs_numpy_alone():
     code = f"import sys, flowrep.viz; print({others} & sys.modules.keys())"
     found = run_python("-c", code, check=True)
     assert found.stdout.strip() == "set()"
+
+
+def test_one_flow_s_scale_leaves_the_others():
+    maps = {name: np.zeros((2, 24, 32)) for name in ("raw", "ego", "obj")}
+    changed = viz.representation_strip(maps, flow_scale_px={"obj": 2.0})
+    assert changed.shape == viz.representation_strip(maps).shape

@@ -75,3 +75,11 @@ def test_a_broken_or_missing_film_is_not_playable(tmp_path):
     assert not viz.is_playable(path)
     path.write_bytes(b"")
     assert not viz.is_playable(path)
+
+
+@pytest.mark.parametrize(
+    "frame", [np.full((32, 32, 3), 0.5), np.zeros((32, 32, 4), np.uint8)], ids=["float", "alpha"]
+)
+def test_what_is_no_picture_is_refused(tmp_path, frame):
+    with pytest.raises(ValueError, match=r"\[H, W, 3\] uint8"):
+        viz.write_video(tmp_path / "film.mp4", [frame], fps=4)
