@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.utils import expand_as_right
 from torch import Tensor
 from torchrl.envs.transforms import Transform
@@ -53,7 +53,8 @@ class Mirror(Transform):
 
     Raises:
         ValueError: `in_keys` repeats a key, `flow_keys` holds a key that `in_keys` lacks,
-            `swapped_actions` doesn't exchange actions in pairs, K has skew, or 2·cx isn't whole.
+            `swapped_actions` doesn't exchange actions in pairs, K has skew, or 2·cx isn't whole; in
+            calls, a map's width differs from 2·cx by half or more.
         RuntimeError: it is used in an env.
 
     Example:
@@ -124,8 +125,18 @@ class Mirror(Transform):
             for step in (tensordict, following):
                 x = None if step is None else step.get(key, None)
                 if x is not None:
+                    self._check_width(key, x.shape[-1])
                     step[key] = mirror_map(x, chosen, self.twice_cx, is_flow=is_flow)
         return tensordict
+
+    def _check_width(self, key: NestedKey, width: int) -> None:
+        # pictures for estimated flow may be several times as large as the camera's maps
+        if self.twice_cx is not None and not width / 1.5 < self.twice_cx < width * 1.5:
+            raise ValueError(
+                f"{key!r} is {width} pixels wide, but 2·cx is {self.twice_cx}: it is not of the "
+                "camera of these intrinsics; leave it out or train without mirror images "
+                "(algorithm.mirror=false)"
+            )
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         raise RuntimeError("Mirror is for replay: append it to a replay buffer, not to an env")

@@ -175,3 +175,18 @@ def test_a_batch_may_lack_the_next_maps_but_not_its_own():
 def test_what_has_no_image_is_refused(options, named):
     with pytest.raises(ValueError, match=named):
         mirror(**options)
+
+
+def test_a_picture_of_another_width_than_the_camera_s_maps_is_refused():
+    K = [[40.0, 0.0, 20.0], [0.0, 40.0, 20.0], [0.0, 0.0, 1.0]]
+    mirror = Mirror(["seg", "rgb"], swapped_actions=SWAPPED, intrinsics=K)
+    td = TensorDict(
+        {
+            "seg": torch.zeros(4, 1, 40, 40),
+            "rgb": torch.zeros(4, 3, 160, 160),  # as drawn for estimated flow
+            "action": torch.zeros(4, dtype=torch.long),
+        },
+        [4],
+    )
+    with pytest.raises(ValueError, match=r"'rgb' is 160 pixels wide, but 2·cx is 40"):
+        mirror(td)
