@@ -256,3 +256,15 @@ def test_without_a_screen_one_line_says_what_is_missing(film):
         pytest.raises(UsageError, match=r"^interactive=true .*screen.*$"),
     ):
         drive_by_hand(Keyboard(never, "never_turn"), film, {"episode_seed": 1})
+
+
+def test_a_scene_of_a_trained_agent_is_not_changed_unless_it_is_named(
+    tmp_path, monkeypatch, capsys
+):
+    (tmp_path / "config.yaml").touch()  # a run's folder
+    typed = [f"policy={tmp_path}", "scene.time_limit_steps=4"]
+    monkeypatch.setattr(sys, "argv", ["flowrep-view", *typed])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 2
+    assert "scene.time_limit_steps= changes a scene: add scene=" in capsys.readouterr().err

@@ -209,6 +209,11 @@ def test_maps_given_to_what_has_its_maps_are_not_ignored():
             Agent.load(name, scene="s_turn", representations={"obj": {}})
 
 
+def test_a_baseline_may_be_asked_for_workers_which_it_can_t_use():
+    agent = Agent.load("never_turn", scene="straight_road", num_workers=1)
+    assert len(agent.evaluate(2)) == 2
+
+
 def test_the_package_has_it_by_name():
     assert flowrep.Agent is Agent
 
