@@ -276,7 +276,7 @@ def test_what_is_imported_late_is_public_too():
 def test_a_step_begun_early_is_the_step(make, in_workers):
     late, early = make(num_envs=2), in_workers
     for env in (late, early):
-        env.set_seed(3)
+        env.set_seed(np.int64(3))
         begin_step(env, env.reset().set("action", torch.tensor([1, 2])))
     begun = early.step(early.reset().set("action", torch.tensor([1, 2])))
     assert differing(late.step(late.reset().set("action", torch.tensor([1, 2]))), begun) == []
