@@ -112,7 +112,7 @@ def evaluate_one(
         build.share_cores(agent.config)
     origin = agent.origin("evaluate")
     # agents of one scene share the baselines' episodes
-    episodes = config.speed, config.fps, config.episodes, config.seed
+    episodes = config.speed, frame_rates(config, agent), config.episodes, config.seed
     evaluation = evaluations.setdefault(
         f"{origin['scene_id']} {candidate.policies}",
         PairedEvaluation(*episodes, candidate.policies, config.baselines),
@@ -146,13 +146,19 @@ def evaluate_one(
     film(config, agent, folder, stop)
 
 
+def frame_rates(config: EvaluateConfig, agent: Agent) -> list[float]:
+    """Returns the frame rates that are asked for, by default that of the agent's scene."""
+    return config.fps or [agent.config.scene.frame_rate_hz]
+
+
 def film(config: EvaluateConfig, agent: Agent, folder: RunFolder, stop: StopRequest) -> None:
     """Writes `video` episodes for each speed and frame rate, until a stop is asked for."""
     from flowrep.experiment.film import record_episode
 
     name = agent.config.scene.name
-    where = "" if name == agent.trained_in else f"{name}_"
-    for speed, rate, number in product(config.speed, config.fps, range(config.video)):
+    where = "" if agent.trained_in and agent.trained_in.name == name else f"{name}_"
+    rates = frame_rates(config, agent)
+    for speed, rate, number in product(config.speed, rates, range(config.video)):
         if stop:
             return
         seed = config.seed + number

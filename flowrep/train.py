@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 from flowrep.extras import require
@@ -66,16 +67,13 @@ def run(config: TrainConfig) -> float:
             return finish(resumed(config, folder, typed), folder)
     folder = RunFolder(job.runtime.output_dir)
     with folder.held("training"):
-        config = folder.begin(config, typed)
+        folder.check_is_new()
         announce(config, str(job.runtime.choices.get("preset")))
-        return finish(config, folder)
+        return finish(config, folder, typed)
 
 
 def resumed(config: TrainConfig, folder: RunFolder, typed: list[str]) -> TrainConfig:
-    """Returns the config of the run to resume, with the changes that are allowed.
-
-    A larger `total_frames` is written to the run's config.
-    """
+    """Returns the config of the run to resume, with the changes that are allowed."""
     typed = [text.lstrip("+") for text in typed if not text.startswith("resume=")]
     given = [text.partition("=")[0] for text in typed]
     trusted = "algorithm._target_"
@@ -98,8 +96,6 @@ def resumed(config: TrainConfig, folder: RunFolder, typed: list[str]) -> TrainCo
             f"total_frames={frames} is less than the run's {stored.total_frames}: a run can be "
             "made longer, not shorter"
         )
-    if frames > stored.total_frames:
-        folder.write_config(stored.plain() | {"total_frames": frames})
     changes = {key: getattr(config, key) for key in given if key not in classes}
     return stored.model_copy(update=changes | {"resume": str(folder.path)})
 
@@ -125,8 +121,11 @@ def announce(config: TrainConfig, preset: str) -> None:
         )
 
 
-def finish(config: TrainConfig, folder: RunFolder) -> float:
-    """Runs what remains of a run (training, evaluation, video) and returns its success."""
+def finish(config: TrainConfig, folder: RunFolder, typed: Iterable[str] = ()) -> float:
+    """Runs what remains of a run (training, evaluation, video) and returns its success.
+
+    Its config is written once everything could be built: what fails before leaves no run behind.
+    """
     from flowrep.agent import CheckpointError, DivergenceError
     from flowrep.envs import WorkerError
     from flowrep.experiment.runner import Runner
@@ -134,8 +133,11 @@ def finish(config: TrainConfig, folder: RunFolder) -> float:
     how_to_go_on = line_for("train", resume=str(folder.path))
     with StopRequest() as stop:
         runner = Runner(config, folder)
-        if config.resume is not None:
+        if config.resume is None:
+            folder.begin(runner.config, typed)
+        else:
             runner.load()
+            folder.lengthen(config.total_frames)
         print(f"run folder: {folder.path}")
         try:
             is_evaluated = complete(runner, stop)

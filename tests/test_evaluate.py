@@ -38,8 +38,8 @@ def saved(path, *overrides):
     """A run that saved its checkpoint before the first frame; its episodes are short."""
     config = composed("debug=smoke", "device=cpu", SHORT, *overrides)
     folder = RunFolder(path)
-    folder.write_config(config.plain())
     runner = Runner(config, folder)
+    folder.begin(runner.config, overrides)
     runner.observation = runner.env.reset()
     runner.save()
     runner.close()
@@ -78,6 +78,13 @@ def test_evaluated_again_the_table_is_the_same_byte_for_byte(untouched):
         assert drives["policy"].tolist() == [row["policy"] for row in rows]
         lengths = np.diff(drives["starts"]) - 1
         assert lengths.tolist() == [int(row["length"]) for row in rows]
+
+
+def test_an_agent_drives_at_the_frame_rate_of_its_scene_unless_another_is_given(tmp_path):
+    folder = saved(tmp_path / "slow", "representations=[obj]", "scene.frame_rate_hz=10")
+    evaluate(asked(f"run={folder.path}"))
+    evaluate(asked(f"run={folder.path}", "fps=12"))
+    assert [row["fps"] for row in folder.read_episodes()] == ["10.0"] * 2 + ["12.0"] * 2
 
 
 def test_a_run_that_is_named_twice_is_evaluated_once(run, tmp_path):
@@ -152,7 +159,7 @@ def some(tmp_path, monkeypatch, driver):
     def load(path, *, scene=None, trusted=(), **machine):
         if not path.name.startswith("good"):
             raise CheckpointError(f"no checkpoint in {path}")
-        return Agent(driver, config.model_copy(update=machine), 64, "straight_road")
+        return Agent(driver, config.model_copy(update=machine), 64, config.scene)
 
     def make(*names, overrides=()):
         monkeypatch.setattr(Agent, "load", load)

@@ -54,9 +54,9 @@ Workers = CountOrZero | Literal["auto"]
 
 
 def _distinct(values: Any) -> Any:
-    # A tuple comes from Python, a list from a config.
-    is_list = isinstance(values, list | tuple)
-    if is_list and any(value in values[:i] for i, value in enumerate(values)):
+    if isinstance(values, tuple):  # from Python; a config has lists
+        values = [*values]
+    if isinstance(values, list) and any(x in values[:i] for i, x in enumerate(values)):
         raise ValueError("a value is repeated")
     return values
 
@@ -217,7 +217,7 @@ class Evaluation(Options):
         return len(self.speeds) * len(self.fps) * policies * self.final_episodes
 
 
-class Episodes(BaseModel):
+class Episodes(Options):
     """Arguments of `Agent.evaluate`."""
 
     episodes: Count
@@ -275,7 +275,7 @@ class EvaluateConfig(Command):
     motion: MotionSource | None = None
     noise: Noise | None = None
     speed: Annotated[SpeedModes, OneOrMore]
-    fps: Annotated[FrameRates, OneOrMore]
+    fps: Annotated[FrameRates | None, OneOrMore]
     episodes: Count
     policy: Annotated[list[Text], Field(min_length=1), Distinct, OneOrMore]
     output: Text | None
@@ -512,7 +512,7 @@ def _line(details: Any) -> str:
         names_itself = key == "" or message.startswith(f"{key} ")  # as those of a scene do
         return message if names_itself else f"{key}: {message}"
     remedy = ""
-    if kind == "list_type":
+    if kind == "list_type" and isinstance(value, str | int | float):
         remedy = f"; write '{key}=[{value}]'"
     elif kind == "int_type" and isinstance(value, float) and value.is_integer():
         remedy = f"; write {value:.0f}"

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torchrl.data import Composite
 
-from flowrep.agent import CheckpointError, load_checkpoint, save_checkpoint
+from flowrep.agent import CheckpointError, load_checkpoint, save_checkpoint, torch_threads
 from flowrep.config import UsageError, closest_first
 from flowrep.config.cli import composed
 from flowrep.config.schema import (
@@ -85,13 +85,18 @@ class Agent(Driver):
             raise UsageError("resume=: continue a run with python -m flowrep.train resume=<folder>")
         config, default, typed = composed("train", overrides, TrainConfig)
         run = RunFolder(default if folder is None else folder)
-        with run.held("training"), StopRequest() as stop:
-            config = run.begin(config, typed)
-            with closing(Runner(config, run, on_log=callback)) as runner:
-                runner.train(stop)
+        run.check_is_new()
+        with (
+            run.held("training"),
+            StopRequest() as stop,
+            torch_threads(torch.get_num_threads()),  # the caller's again afterwards
+            closing(Runner(config, run, on_log=callback)) as runner,
+        ):
+            run.begin(runner.config, typed)
+            runner.train(stop)
         if stop:
             raise KeyboardInterrupt(f"stopped after {runner.frames} frames; saved in {run.path}")
-        return cls(runner.agent.policy, config, runner.frames, config.scene.name)
+        return cls(runner.agent.policy, runner.config, runner.frames, config.scene)
 
     @classmethod
     def load(
@@ -175,14 +180,14 @@ class Agent(Driver):
                 f"the agent of {name} can't be used in scene '{config.scene.name}', whose "
                 f"classes are not those of its training ({reason})"
             ) from error
-        return cls(policy, config, frames, trained.scene.name)
+        return cls(policy, config, frames, trained.scene)
 
     def evaluate(
         self,
         episodes: int = 100,
         *,
-        speeds: Sequence[str] = (),
-        fps: Sequence[float] = (),
+        speeds: Sequence[str] | None = None,
+        fps: Sequence[float] | None = None,
         seed: int = FIRST_SEEDS["evaluate"],
         policies: Sequence[str] = ("greedy",),
         baselines: Sequence[str] = (),
@@ -199,8 +204,8 @@ class Agent(Driver):
         """
         values = {
             "episodes": episodes,
-            "speeds": speeds or [self.config.speed],
-            "fps": fps or [self.config.scene.frame_rate_hz],
+            "speeds": [self.config.speed] if speeds is None else speeds,
+            "fps": [self.config.scene.frame_rate_hz] if fps is None else fps,
             "seed": seed,
             "policies": policies,
             "baselines": baselines,
@@ -215,7 +220,7 @@ class Agent(Driver):
         return evaluation.records(**self.origin("evaluate"))
 
     def save(self, path: str | Path, *, small: bool = False) -> None:
-        """Writes the policy and its config into one file, which `load` reads.
+        """Writes the policy and the config of its training into one file, which `load` reads.
 
         With `small`, each weight takes one byte, see `packed`.
         """
@@ -224,7 +229,8 @@ class Agent(Driver):
         if Path(path).suffix != ".safetensors":
             raise UsageError(f"save to a file whose name ends in .safetensors, not to '{path}'")
         weights = dict(self.policy.state_dict())  # type: ignore[attr-defined]
-        state = {"frames": self.frames, "config": self.config.plain()}
+        config = self.config.model_copy(update={"scene": self.trained_in})
+        state = {"frames": self.frames, "config": config.plain()}
         save_checkpoint(path, state | {"policy": packed(weights) if small else weights})
 
 

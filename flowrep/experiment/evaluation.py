@@ -49,7 +49,7 @@ class Driver:
     policy: Policy | str  # writes `action`; or a baseline's name
     config: EnvConfig
     frames: int = 0  # frames of its training; 0 if unknown
-    trained_in: str | None = None  # the name of a scene, None if unknown
+    trained_in: Scene | None = None  # None if unknown
 
     def make_env(self, **changes: Any) -> EnvBase:
         """Returns the config's env; `changes` replace arguments of `flowrep.envs.make_env`."""

@@ -213,18 +213,20 @@ class RunFolder:
         """Returns the path of the video with this name."""
         return self.path / "videos" / f"{name}.mp4"
 
-    def begin(self, config: TrainConfig, overrides: Iterable[str]) -> TrainConfig:
-        """Writes a new run's config and overrides; returns the config, with resolved precision."""
-        from flowrep.experiment import build
-
+    def begin(self, config: TrainConfig, overrides: Iterable[str]) -> None:
+        """Writes a new run's config and overrides."""
         self.check_is_new()
-        config = build.with_precision(config)
         self._prepare()
         (self.path / ".hydra").mkdir(exist_ok=True)  # where Hydra keeps the overrides
         typed = yaml.safe_dump(list(overrides), allow_unicode=True)
         replace_text(self.path / ".hydra" / "overrides.yaml", typed)
         self.write_config(config.plain())
-        return config
+
+    def lengthen(self, total_frames: int) -> None:
+        """Writes to a run's config that it is longer, unless it says so already."""
+        config = self.read_config()
+        if config["total_frames"] != total_frames:
+            self.write_config(config | {"total_frames": total_frames})
 
     def write_config(self, config: Mapping[str, Any]) -> None:
         """Writes the resolved config."""

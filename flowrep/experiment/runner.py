@@ -49,6 +49,7 @@ class Runner:
         folder: RunFolder,
         on_log: Callable[[dict[str, float]], Any] | None = None,  # gets each row of metrics.csv
     ) -> None:
+        config = build.with_precision(config)
         self.config, self.folder, self.clock = config, folder, Stopwatch()
         self.on_log = on_log
         logging.getLogger("torchrl").setLevel(logging.WARNING)  # it logs every storage it creates

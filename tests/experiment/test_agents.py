@@ -65,8 +65,26 @@ def test_an_agent_is_the_same_from_its_run_and_from_a_file(trained, tmp_path):
     for name in (folder, tmp_path / "12:00", tmp_path / "agent.safetensors"):
         again = Agent.load(name, device="cpu")
         assert differing(again.policy.state_dict(), agent.policy.state_dict()) == []
-        assert (again.frames, again.trained_in) == (128, "s_turn")
+        assert (again.frames, again.trained_in) == (128, agent.config.scene)
     assert again.evaluate(episodes=2) == episodes
+
+
+def test_what_is_saved_is_the_config_of_the_training_not_of_another_scene(trained, tmp_path):
+    agent, folder, _ = trained
+    elsewhere = Agent.load(folder, scene="straight_road", device="cpu")
+    elsewhere.save(tmp_path / "agent.safetensors")
+    again = Agent.load(tmp_path / "agent.safetensors", device="cpu")
+    assert again.config.scene == agent.config.scene != elsewhere.config.scene
+
+
+def test_the_threads_of_the_program_that_trains_stay_its_own(tmp_path):
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        Agent.train(folder=tmp_path / "run", **TINY)
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_a_small_file_rounds_weights_to_a_byte(trained, tmp_path):
@@ -127,6 +145,12 @@ def test_the_folder_of_another_run_is_refused(trained):
         Agent.train(folder=folder, debug="smoke")
 
 
+def test_a_run_that_can_not_be_built_does_not_take_its_folder(tmp_path):
+    with pytest.raises(ValueError, match="8"):  # too small a picture for the encoder
+        Agent.train(folder=tmp_path / "run", **TINY, **{"scene.camera.height_px": 8})
+    Agent.train(folder=tmp_path / "run", **TINY)
+
+
 @pytest.mark.parametrize(
     ("given", "named"),
     [
@@ -135,6 +159,9 @@ def test_the_folder_of_another_run_is_refused(trained):
         ({"speeds": "low"}, "speeds"),
         ({"speeds": ("low", "low")}, "speeds"),
         ({"fps": [0]}, "fps"),
+        ({"fps": np.array([6, 12])}, "fps"),
+        ({"fps": ()}, "fps"),
+        ({"episodes": "2"}, "episodes"),
         ({"seed": -1}, "seed"),
         ({"policies": ["best"]}, "policies"),
         ({"policies": ["sampled"]}, "policies"),  # it has no probabilities to draw from

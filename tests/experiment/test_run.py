@@ -337,10 +337,11 @@ def test_only_what_was_written_before_the_first_checkpoint_is_dropped_without_on
 
 def test_config_comes_back_as_written(tmp_path):
     run = RunFolder(tmp_path)
-    config = run.begin(composed("seed=3", "debug=smoke"), ["seed=3"])
+    config = composed("seed=3", "debug=smoke")
+    run.begin(config, ["seed=3"])
     assert RunFolder.existing(tmp_path).config() == config
-    run.write_config(CONFIG)  # as for a run that is made longer
-    assert RunFolder.existing(tmp_path).read_config() == CONFIG
+    run.lengthen(512)
+    assert run.read_config() == config.plain() | {"total_frames": 512}
     assert (tmp_path / ".hydra" / "overrides.yaml").read_text() == "- seed=3\n"
 
 

@@ -9,14 +9,14 @@ import torch
 from tensordict import TensorDict
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from flowrep.agent import DivergenceError
+from flowrep.agent import CheckpointError, DivergenceError
 from flowrep.config import UsageError, group_choices
-from flowrep.config.schema import validated_run
 from flowrep.experiment import build
 from flowrep.experiment.lock import RunFolderError
 from flowrep.experiment.run import RunFolder
 from flowrep.experiment.runner import Means, RecentEpisodes, Runner, progress_text
 from flowrep.progress import StopRequest
+from flowrep.train import finish as finish_run
 from flowrep.train import resumed
 from tests.comparing import differing
 from tests.config.composing import composed, plain
@@ -144,8 +144,18 @@ def test_a_resumed_run_keeps_its_machine_settings_unless_others_are_given(tmp_pa
         with pytest.raises(UsageError, match=given.split("=")[0]):
             settings("device=cpu", given)
     assert settings("total_frames=512") == ("cpu", 2, 512)
-    assert validated_run(folder.read_config(), "").total_frames == 512
-    assert folder.read_config()["num_workers"] == 2
+    assert folder.read_config() == own  # until its checkpoint is read
+
+
+def test_a_run_that_can_not_be_resumed_has_not_become_longer(tmp_path):
+    folder = RunFolder(tmp_path)
+    folder.write_config(plain("train", "debug=smoke", "device=cpu"))
+    folder.checkpoint_path.parent.mkdir()
+    folder.checkpoint_path.write_bytes(b"damaged")
+    typed = [f"resume={tmp_path}", "total_frames=512"]
+    with pytest.raises(CheckpointError):
+        finish_run(resumed(composed(*typed), folder, typed), folder)
+    assert folder.config().total_frames == 256
 
 
 def test_updates_use_the_threads_of_the_config_and_all_else_one(tmp_path):
