@@ -58,6 +58,14 @@ def test_an_agent_acts_on_it_and_a_film_shows_it(config):
     film.close()
 
 
+def test_a_film_leaves_out_a_map_that_is_no_picture_of_the_camera_s_shape(config):
+    upright = {"_target_": "torchrl.envs.PermuteTransform", "dims": [-3, -1, -2]}
+    own = {"ego": {"scale": 1.0}, "upright": {**upright, "in_keys": [("sensor", "depth")]}}
+    film = Film(Agent("never_turn", config.model_copy(update={"representations": own})))
+    assert film.framed == ["ego"]
+    film.close()
+
+
 def test_its_options_reach_it_and_are_checked_by_it(config):
     def edges(**options):
         own = {"edges": {"_target_": "mine.Edges", **options}}

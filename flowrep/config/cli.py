@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager
 from hashlib import sha1
+from itertools import product
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -62,6 +63,8 @@ def run_hydra(config_name: str, job: Callable[[DictConfig], Any], schema: type[C
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace", line_buffering=True)
+    if not sys.flags.safe_path and os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # for policies and classes in modules there, as with -m
     register_resolvers()
     main = hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name=config_name)
     try:
@@ -156,6 +159,7 @@ def checked(config: DictConfig, schema: type[Command]) -> Any:
     """Returns a composed config as its model; keys that the user added (`+note=pilot`) pass."""
     plain, job = plain_config(config), config.get("hydra") or HydraConfig.get()
     model = validated(schema, plain)
+    _check_no_file_is_hidden(job)
     typed = job.overrides.task
     keys = [text.partition("=")[0].rpartition("@")[2] for text in typed]  # +group@key=choice
     for key in (model.model_extra or {}).keys() - {key.lstrip("+").split(".")[0] for key in keys}:
@@ -169,6 +173,18 @@ def checked(config: DictConfig, schema: type[Command]) -> Any:
             f"name: {choice} in its file, or add scene.name={choice}"
         )
     return model
+
+
+def _check_no_file_is_hidden(job: Any) -> None:
+    """Checks that no file of the user's has the path of one of flowrep's, which Hydra would read.
+
+    An unchanged copy of that file is allowed.
+    """
+    sources = (source for source in job.runtime.config_sources if source.schema == "file")
+    for source, own in product(sources, CONF_DIR.glob("**/*.yaml")):
+        file = Path(source.path) / own.relative_to(CONF_DIR)
+        if file.is_file() and file.read_bytes() != own.read_bytes():
+            raise UsageError(f"{file} is not read, as flowrep has a file of that name: rename it")
 
 
 def plain_config(config: DictConfig) -> dict[str, Any]:
@@ -357,8 +373,9 @@ def folder_name(text: str) -> str:
     >>> folder_name("s_turn"), folder_name("../../etc"), folder_name("..")
     ('s_turn', '_.._etc', '_')
     """
-    name = "".join(c if c.isprintable() and c not in "/\\" else "_" for c in str(text))[:200]
-    return name.lstrip(".") or "_"
+    name = "".join(c if c.isprintable() and c not in "/\\" else "_" for c in str(text))
+    # file systems allow 255 bytes
+    return name.encode()[:200].decode(errors="ignore").lstrip(".") or "_"
 
 
 def run_of_sweep(overrides: Iterable[str]) -> str:

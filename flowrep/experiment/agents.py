@@ -41,6 +41,7 @@ from flowrep.experiment.run import RunFolder, check_origin, origin_of
 from flowrep.experiment.runner import Runner
 from flowrep.progress import StopRequest
 from flowrep.scenes import Scene, load_scene
+from flowrep.transforms.stack import REPRESENTATIONS, representation_options
 
 PRETRAINED = Path(__file__).parents[1] / "pretrained"
 """Agents that come with flowrep, one for each scene; README.md there is their card."""
@@ -295,9 +296,10 @@ def _external(reference: str, config: EnvConfig) -> Any:
     """Returns a policy from another project, built for the task in the config's env."""
     with closing(build.env(config, num_envs=1, num_workers=0)) as env:
         maps = {name: env.observation_spec[name][0] for name in config.representations}
+        given = config.representations.items()
         task = Task(
             scene=config.scene.name,
-            representations=config.representations,
+            representations={n: _whole_options(n) | dict(options or {}) for n, options in given},
             observation_spec=Composite(maps),
             action_spec=env.action_spec[0],
             intrinsics=torch.from_numpy(street_envs(env)[0].K),
@@ -305,6 +307,11 @@ def _external(reference: str, config: EnvConfig) -> Any:
         )
     check_card(reference, task)
     return load_policy(reference, task)
+
+
+def _whole_options(name: str) -> dict[str, Any]:
+    """Returns a representation's options with their defaults, none for one of the user's."""
+    return representation_options(name) if name in REPRESENTATIONS else {}
 
 
 def packed(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -32,6 +32,8 @@ _LIBRARIES = (
 )  # fmt: skip
 """Prefixes of the names of files that the author of a policy didn't write."""
 
+_FOLDERS: set[Path] = set()  # of the scripts that were loaded
+
 
 class PolicyError(Exception):
     """A policy from another project is missing, fails or returns no actions."""
@@ -112,7 +114,17 @@ def _module(name: str) -> Any:
     if not name.endswith(".py"):
         return import_module(name)
     path = Path(name).resolve(strict=True)
-    sys.path.insert(0, str(path.parent))  # as Python does for a script
+    folder = path.parent
+    for loaded, module in list(sys.modules.items()):
+        file = Path(getattr(module, "__file__", None) or "/")
+        is_beside_another = {file.parent, file.parent.parent} & (_FOLDERS - {folder})
+        if is_beside_another and any((folder / own).exists() for own in (loaded, f"{loaded}.py")):
+            raise PolicyError(
+                f"would import {file} instead of the module '{loaded}' beside it: evaluate it "
+                "with a command of its own"
+            )
+    _FOLDERS.add(folder)
+    sys.path.insert(0, str(folder))  # as Python does for a script
     spec = spec_from_file_location(f"flowrep_policy_{path.stem}", path)
     assert spec is not None
     assert spec.loader is not None
@@ -210,8 +222,9 @@ def _settings(card: Mapping[str, Any], task: Task) -> tuple[dict[str, Any], dict
         for option, value in maps[name]["options"].items():
             key = f"representations.{name}.{option}"
             trained[key], here[key] = value, task.representations[name].get(option)
-        spec = task.observation_spec[name]
-        if isinstance(spec, Categorical) and spec.n != card["num_classes"]:
+        spec, channels = task.observation_spec[name], maps[name]["shape"][0]
+        has_other_ids = isinstance(spec, Categorical) and spec.n != card["num_classes"]
+        if has_other_ids or spec.shape[0] != channels:
             trained["scene"], here["scene"] = card["scene"], task.scene
     return trained, here
 

@@ -103,12 +103,12 @@ class Film:
         self.framed = [name for name in read if name in self.tiles]
         # By tile: the key of its map, and the function that converts the map to the tile's units.
         self._maps = {name: (name, self._in_units(name)) for name in self.tiles}
-        for name in read:
-            if name not in self._maps:
-                self._add_tiles(name)
         height, width = self.env.observation_spec["seg"].shape[-2:]
         zoom = tile_zoom(height, width)
         self._tile_size = zoom * height, zoom * width
+        for name in read:
+            if name not in self._maps:
+                self._add_tiles(name)
 
     def drive(
         self,
@@ -204,8 +204,14 @@ class Film:
         return lambda values: values
 
     def _add_tiles(self, name: str) -> None:
-        """Adds tiles for a representation without a stock tile: one per frame, or per channel."""
+        """Adds tiles for a representation without a stock tile: one per frame, or per channel.
+
+        A map of another ratio of height to width gets none.
+        """
         spec, in_units = self.env.observation_spec[name], self._in_units(name)
+        height, width = self._tile_size
+        if spec.shape[-2] * width != spec.shape[-1] * height:
+            return  # it has no place in a strip of the camera's pictures
         if frames_of := {"seg2": "seg", "depth2": "depth"}.get(name):
             tile, count = self.tiles[frames_of], int(self._options(name)["k"])
             tile = tile._replace(about=f"{tile.about} The last {count} frames, oldest first.")

@@ -110,10 +110,10 @@ def flow_wheel(size_px: int) -> Image:
 
 def classes_to_rgb(semantic: Any) -> Image:
     """Returns class ids, `semantic` `[1, H, W]`, as `CLASS_COLOURS`; unknown ids are grey."""
-    ids = _channels("semantic", semantic, 1)[0]
-    palette = np.full((256, 3), _UNKNOWN, dtype=np.uint8)
-    palette[: len(CLASS_COLOURS)] = list(CLASS_COLOURS.values())
-    return palette[ids.astype(np.uint8)]
+    ids = _channels("semantic", semantic, 1)[0].astype(int)
+    palette = np.array([*CLASS_COLOURS.values(), _UNKNOWN], dtype=np.uint8)
+    is_known = (ids >= 0) & (ids < len(CLASS_COLOURS))
+    return palette[np.where(is_known, ids, -1)]
 
 
 def grey_to_rgb(values: Any, low: float = -1.0, high: float = 1.0) -> Image:

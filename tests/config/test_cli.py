@@ -217,6 +217,25 @@ def test_a_scene_file_that_kept_the_name_of_its_original_is_refused(run, tmp_pat
     assert run("train", *line)[0] == 0
 
 
+def test_a_file_in_whose_place_hydra_reads_another_is_named(run, tmp_path):
+    (tmp_path / "scene").mkdir()
+    original = (CONF_DIR / "scene" / "s_turn.yaml").read_text()
+    mine = tmp_path / "scene" / "s_turn.yaml"
+    mine.write_text(original)
+    assert run("train", "--config-dir", str(tmp_path))[0] == 0
+    mine.write_text(original + "# mine\n")
+    for line in (["--config-dir", str(tmp_path)], [f"hydra.searchpath=[file://{tmp_path}]"]):
+        code, found, said = run("train", *line)
+        assert (code, found) == (2, [])
+        assert f"error: {mine} is not read" in said.err
+
+
+def test_an_installed_command_finds_modules_in_the_current_folder(run, monkeypatch, tmp_path):
+    monkeypatch.setattr(sys, "path", ["/usr/bin"])
+    assert run("train")[0] == 0
+    assert sys.path == ["/usr/bin", str(tmp_path)]
+
+
 # Names with any characters.
 
 ODD = [
@@ -298,13 +317,15 @@ def test_run_folders_are_named_by_scene_representations_and_seed():
     assert folder("resume=there") == "."  # nothing is made for a run that has a folder
 
 
-@pytest.mark.parametrize("name", ["../../etc", "/etc", "..", "a/b", "..\\b", "x" * 500, ""])
+@pytest.mark.parametrize(
+    "name", ["../../etc", "/etc", "..", "a/b", "..\\b", "x" * 500, "ä" * 500, "\udcff", ""]
+)
 def test_a_name_becomes_a_visible_folder_in_the_output_folder(name):
     folder = cli.folder_name(name)
     assert folder
     assert not folder.startswith(".")
     assert Path(folder).name == folder
-    assert len(folder) <= 255
+    assert len(folder.encode()) <= 255
 
 
 def test_names_of_a_sweeps_runs_need_no_quotes_and_stay_apart():

@@ -70,6 +70,19 @@ def test_make_is_told_the_task_and_may_import_what_lies_beside_it(tmp_path):
     assert load_policy(f"{path}:make", TASK)(maps(3))["action"].tolist() == [2, 2, 2]
 
 
+def test_two_policies_do_not_share_what_lies_beside_one(tmp_path):
+    for number, name in enumerate(["first", "second"]):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "my_model.py").write_text(f"SIDE = {number}\n")
+        script = "import my_model\nmake = lambda task: lambda maps: [my_model.SIDE] * len(maps)"
+        (tmp_path / name / "mine.py").write_text(script)
+    first = load_policy(f"{tmp_path}/first/mine.py:make", TASK)
+    assert load_policy(f"{tmp_path}/first/mine.py:make", TASK)(maps())["action"].tolist() == [0, 0]
+    with pytest.raises(PolicyError, match=r"first/my_model\.py instead of the module 'my_model'"):
+        load_policy(f"{tmp_path}/second/mine.py:make", TASK)
+    assert first(maps())["action"].tolist() == [0, 0]
+
+
 def test_a_program_that_torch_saved_is_a_policy(tmp_path):
     class Scores(torch.nn.Module):
         def forward(self, ego, depth):
@@ -156,9 +169,9 @@ CARD = {
 }
 
 
-def task(names=("ego", "seg"), size=(30, 52), classes=5, **changes):
+def task(names=("ego", "seg"), size=(30, 52), classes=5, channels=2, **changes):
     specs = {
-        "ego": Unbounded((2, *size)),
+        "ego": Unbounded((channels, *size)),
         "seg": Categorical(classes, (1, *size), dtype=torch.uint8),
         "depth": Unbounded((1, *size)),
     }
@@ -208,8 +221,9 @@ SCALED = {**OPTIONS, "ego": {"scale": 0.5}}
             "representations.ego.scale=1.0",
         ),
         (task(classes=6, scene="s_turn"), "scene=s_turn", "scene=straight_road"),
+        (task(channels=3, scene="s_turn"), "scene=s_turn", "scene=straight_road"),
     ],
-    ids=["size", "view", "one too few", "others", "options", "classes"],
+    ids=["size", "view", "one too few", "others", "options", "classes", "one-hot classes"],
 )
 def test_other_maps_are_refused_with_the_overrides_for_its_own(agent, shown, here, give):
     with pytest.raises(PolicyError) as caught:

@@ -73,6 +73,11 @@ def test_classes_take_their_colour_from_the_one_table():
     assert [tuple(pixel) for pixel in image[0].tolist()] == [*colours, (128, 128, 128)]
 
 
+def test_ids_beyond_those_of_a_byte_are_unknown_too():
+    image = viz.classes_to_rgb(torch.tensor([[[-1, 255, 256, 260]]]))
+    assert (image == 128).all()
+
+
 def test_depth_gets_darker_and_ends_in_black_where_nothing_is():
     depth = np.array([[[0.0, 1.0, 9.0, 99.0, 150.0, np.inf, np.nan]]], dtype=np.float32)
     near, *rest, far, further, sky, missing = viz.depth_to_rgb(depth, range_m=99.0)[0].astype(int)
