@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from flowrep.config.cli import line_for
 from flowrep.experiment.run import DRIVES, read_drives
 from flowrep.report.figures import encoded, words
 from flowrep.report.runs import Run, groups_of, scenes_of
@@ -80,8 +81,8 @@ def drives_of(runs: Sequence[Run], *, trajectories: int, videos: int) -> Drives:
             picture = EmbeddedPicture(title, film.name, data_uri("video/mp4", film.read_bytes()))
             drives.films.setdefault(f"{scene}, {words(film.stem)}", []).append(picture)
         if videos and not films:
-            remedy = f"python -m flowrep.evaluate run={run.name} video=1"
-            drives.warnings.append(f"{run.name} has no films: {remedy}")
+            remedy = f": {line_for('evaluate', run=run.name)} video=1" if run.folder else ""
+            drives.warnings.append(f"{run.name} has no films{remedy}")
     return drives
 
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from matplotlib.figure import Figure
 
+from flowrep.config.cli import line_for
 from flowrep.report.figures import draw_bars, draw_curves, draw_rates, encoded, words
 from flowrep.report.runs import (
     BASELINES,
@@ -114,10 +115,12 @@ def _unusable(run: Run, policy: str) -> str | None:
         return f"{run.name} is not trained to the end, at {reached}: {unused}"
     driven = {condition.policy for condition in run.conditions}
     if policy not in driven:
-        remedy = f"python -m flowrep.evaluate run={run.name} policy={policy} adds one"
+        remedy = ""
+        if run.folder is not None:
+            remedy = f"; {line_for('evaluate', run=run.name, policy=policy)} adds one"
         for other in driven & {"greedy", "sampled"}:
             remedy += f"; a report with policy={other} has the one that there is"
-        return f"{run.name} has no final {policy} evaluation: {unused}; {remedy}"
+        return f"{run.name} has no final {policy} evaluation: {unused}{remedy}"
     return None
 
 

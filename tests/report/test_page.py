@@ -1,6 +1,7 @@
 """A whole report: the command, its page in a browser, and the drives and films that it shows."""
 
 import re
+import shlex
 import sys
 from itertools import product
 
@@ -12,6 +13,7 @@ pytest.importorskip("scipy", reason="reports are an extra")
 pytest.importorskip("jinja2", reason="reports are an extra")
 
 from flowrep.config import CONF_DIR
+from flowrep.config.cli import value_of
 from flowrep.config.schema import ReportConfig
 from flowrep.experiment.run import DRIVES
 from flowrep.report.__main__ import main, report
@@ -153,12 +155,14 @@ def test_only_greedy_drives_of_the_finished_agent_as_it_was_trained_are_drawn(tm
 
 @pytest.mark.parametrize("content", [None, b"", b"PK\x03\x04 damaged"])
 def test_a_run_without_drives_or_films_is_a_line(tmp_path, content):
-    run_in(tmp_path, "run", "sco")
+    run = run_in(tmp_path, "a run, mine", "sco")
     if content is not None:
-        (tmp_path / "run" / DRIVES).write_bytes(content)
-    drives = drives_of([read_run(tmp_path / "run")], trajectories=2, videos=1)
+        (run / DRIVES).write_bytes(content)
+    drives = drives_of([read_run(run)], trajectories=2, videos=1)
     assert (drives.plans, drives.films) == ({}, {})
     assert ["plan" in line for line in drives.warnings] == [True, False]
+    *_, where, what = shlex.split(drives.warnings[1])  # as a shell reads the remedy
+    assert (value_of(where), what) == (str(run), "video=1")
 
 
 def test_a_plan_and_films_of_one_agent_of_each_stack(tmp_path):
