@@ -22,7 +22,7 @@ from hydra.utils import get_class
 
 from flowrep.config import UsageError
 from flowrep.config.cli import run_command
-from flowrep.config.schema import FactorizeConfig, check_options
+from flowrep.config.schema import FactorizeConfig, check_reader_options
 
 if TYPE_CHECKING:
     from flowrep import sequences
@@ -81,7 +81,7 @@ def factorize_recording(config: FactorizeConfig) -> int:
 def open_stream(config: FactorizeConfig) -> sequences.Stream:
     """Returns the recording or camera that `input` and `format` name."""
     reader, options = get_class(config.format.target), config.format.options()
-    check_options(reader, options, "format")
+    check_reader_options(reader, options)
     return reader(str(config.input), **options)
 
 

@@ -131,7 +131,7 @@ class BulletCamera:
         self._picture["projectionMatrix"] = list(projection)
         flags = pybullet.ER_SEGMENTATION_MASK_OBJECT_AND_LINKINDEX
         self._picture["flags"] = self._picture.get("flags", 0) | flags
-        self.K, self._range_m = self._read(np.array(projection, dtype=np.float32))
+        self.K, self._range_m = self._intrinsics(np.array(projection, dtype=np.float32))
         self._view, self._link = view, link
         self._has_links, self.max_instances = instances == "links", max_instances
         self._classes, self._has_rgb = classes, rgb
@@ -188,15 +188,14 @@ class BulletCamera:
             maps["rgb"] = spaces.Box(0, 255, (3, *size[1:]), np.uint8)
         return spaces.Dict(maps)
 
-    def _read(self, projection: Array) -> tuple[Array, tuple[float, float]]:
+    def _intrinsics(self, projection: Array) -> tuple[Array, tuple[float, float]]:
         """Returns K and the near and far plane of a projection, float32 as PyBullet reads it."""
         matrix = projection.reshape(4, 4).T
-        free = {(0, 0), (0, 2), (1, 1), (1, 2), (2, 2), (2, 3), (3, 2)}
-        fixed = [matrix[i, j] for i in range(4) for j in range(4) if (i, j) not in free]
+        free = np.array([[1, 0, 1, 0], [0, 1, 1, 0], [0, 0, 1, 1], [0, 0, 1, 0]], dtype=bool)
         with np.errstate(divide="ignore", invalid="ignore"):
             near_m = matrix[2, 3] / (matrix[2, 2] - 1)
             far_m = matrix[2, 3] / (matrix[2, 2] + 1)
-        if any(fixed) or matrix[3, 2] != -1 or not 0 < near_m < far_m:
+        if matrix[~free].any() or matrix[3, 2] != -1 or not 0 < near_m < far_m:
             raise ValueError(
                 "projection must be that of a perspective camera, as computeProjectionMatrixFOV "
                 f"and computeProjectionMatrix return it; got {projection.tolist()}"
@@ -288,10 +287,8 @@ class BulletCamera:
             )
         maps = {"depth": depth[None], "instance": instance[None].astype(self._instance_type)}
         if self._classes is not None:
-            class_of = np.zeros(int(body.max()) + 1, dtype=np.uint8)
-            for number, class_id in self._classes.items():
-                if number < len(class_of):
-                    class_of[number] = class_id
+            numbers = range(int(body.max()) + 1)
+            class_of = np.array([self._classes.get(n, 0) for n in numbers], dtype=np.uint8)
             maps["semantic"] = np.where(is_sky, np.uint8(0), class_of[body])[None]
         if self._has_rgb:
             colours = np.asarray(rgba, dtype=np.uint8).reshape(*shape, 4)[..., :3]
@@ -461,16 +458,11 @@ class _Body:
 
 def _transforms(positions: Sequence[View], quaternions_xyzw: Sequence[View]) -> Array:
     """Returns the transforms [N, 4, 4] of N positions and quaternions."""
-    transforms = np.zeros((len(positions), 4, 4))
-    x, y, z, w = np.array(quaternions_xyzw, dtype=np.float64).reshape(-1, 4).T
-    rows = [
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    ]
-    transforms[:, :3, :3] = np.stack(rows, -1).reshape(-1, 3, 3)
-    transforms[:, :3, 3] = np.array(positions, dtype=np.float64).reshape(-1, 3)
-    transforms[:, 3, 3] = 1.0
+    count = len(positions)
+    transforms = np.tile(np.eye(4), (count, 1, 1))
+    turns = [pybullet.getMatrixFromQuaternion(quaternion) for quaternion in quaternions_xyzw]
+    transforms[:, :3, :3] = np.reshape(turns, (count, 3, 3))
+    transforms[:, :3, 3] = np.reshape(positions, (count, 3))
     return transforms
 
 

@@ -35,7 +35,7 @@ from yaml import YAMLError
 
 from flowrep import __version__
 from flowrep.config import CONF_DIR, UsageError, closest_first, config_groups, group_choices
-from flowrep.config.schema import Command, validated
+from flowrep.config.schema import Command, TrainConfig, validated
 
 EXIT_USAGE = 2
 FOLDERS = ("resume", "run", "input", "output", "hydra.run.dir", "hydra.sweep.dir")
@@ -81,21 +81,19 @@ def run_hydra(config_name: str, job: Callable[[DictConfig], Any], schema: type[C
         end_with(error, schema)
 
 
-def composed(
-    config_name: str, values: Mapping[str, Any], schema: type[Command]
-) -> tuple[Any, str, list[str]]:
-    """Returns the model of a command's config with these values, for use in Python.
+def composed(values: Mapping[str, Any]) -> tuple[TrainConfig, str, list[str]]:
+    """Returns the config of a training with these values, for use in Python.
 
-    Also returns the folder that the command would choose, and the values as overrides.
+    Also returns the folder that `flowrep.train` would choose, and the values as overrides.
     """
     typed = list(_overrides(values))
     register_resolvers()
     try:
         with _own_hydra(), hydra.initialize_config_dir(str(CONF_DIR), version_base="1.3"):
-            config = hydra.compose(config_name, typed, return_hydra_config=True)
-        return checked(config, schema), str(config.hydra.run.dir), typed
+            config = hydra.compose("train", typed, return_hydra_config=True)
+        return checked(config, TrainConfig), str(config.hydra.run.dir), typed
     except (HydraException, OmegaConfBaseException, ValueError) as error:
-        raise UsageError(explained(error, schema)) from None
+        raise UsageError(explained(error, TrainConfig)) from None
 
 
 @contextmanager

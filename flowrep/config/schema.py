@@ -91,7 +91,7 @@ class Command(Options):
 
 
 def _in_their_order(value: Any, check: Any) -> dict[str, Any]:
-    """Checks options and returns them as they are: a model would forget the order of its keys."""
+    """Checks options and returns them unchanged: a model would not keep the order of its keys."""
     if isinstance(value, Mapping) and not all(str(name).isidentifier() for name in value):
         raise ValueError("a name consists of letters, digits and _")
     check(value)
@@ -483,16 +483,15 @@ def check_policy(name: str) -> None:
         raise UsageError(f"policy={name}: there is no file '{file}'")
 
 
-def check_options(maker: type, options: Mapping[str, Any], section: str) -> None:
-    """Checks a section's options against a constructor's parameters, except for the first one."""
-    hints = get_type_hints(maker.__init__)  # type: ignore[misc]
-    _, *parameters = inspect.signature(maker).parameters.values()
+def check_reader_options(reader: type, options: Mapping[str, Any]) -> None:
+    """Checks the section `format` against the reader's parameters, except for the first one."""
+    hints = get_type_hints(reader.__init__)  # type: ignore[misc]
+    _, *parameters = inspect.signature(reader).parameters.values()
     fields: dict[str, Any] = {
         p.name: (hints[p.name], ... if p.default is p.empty else p.default) for p in parameters
     }
-    checked = create_model(maker.__name__, __base__=Options, **fields)
-    whole: Any = {section: (checked, ...)}
-    validated(create_model("Config", **whole), {section: options})
+    section: Any = create_model(reader.__name__, __base__=Options, **fields)
+    validated(create_model("Config", format=(section, ...)), {"format": options})
 
 
 def _key(details: Any) -> str:

@@ -95,15 +95,16 @@ def diagnose(
     named = [names[i] for i in able.tolist()]
     result = diagnosed(pairs.of(able), [], rivals, named, _call, stand)
     faults, odd = _recomputed(seen, ego_key, obj_key)
-    fault, untested, doubt = ([], [], []) if result.is_wrong else _bodies(seen, pairs.depth_step)
+    kind, of_bodies = ("", "") if result.is_wrong else _bodies(seen, pairs.depth_step)
     odd += left_out(reasons, sum(not why for why in reasons))
-    result = replace(result, notes=(*result.notes, *odd, *untested))
-    if faults := [*faults, *fault]:
+    odd += [of_bodies] * (kind == "untested")
+    result = replace(result, notes=(*result.notes, *odd))
+    if faults := [*faults, *[of_bodies] * (kind == "fault")]:
         words = "; ".join([result.words, *faults] if result.is_wrong else faults)
         verdict = result.verdict if result.is_wrong else "wrong"
         return replace(result, verdict=verdict, words=words)
-    if doubt and result.is_right:
-        return replace(result, verdict="can't tell", words=f"{doubt[0]}; else {result.words}")
+    if kind == "doubt" and result.is_right:
+        return replace(result, verdict="can't tell", words=f"{of_bodies}; else {result.words}")
     return result
 
 
@@ -209,29 +210,29 @@ def _recomputed(seen: _Seen, ego_key: str, obj_key: str) -> tuple[list[str], lis
     return faults, odd
 
 
-def _bodies(seen: _Seen, depth_step: float) -> tuple[list[str], list[str], list[str]]:
-    """Returns what is wrong with ids and motions of bodies, what isn't tested, what is in doubt.
+def _bodies(seen: _Seen, depth_step: float) -> tuple[str, str]:
+    """Returns "fault", "untested", "doubt" or "" of bodies' ids and motions, and the reason.
 
     Each body of each frame is judged as the camera is: by what its motion leaves of the depth of
     the frame before, on the body's pixels, and by what the best motion would leave there.
     """
     count, ids = seen.rows.shape[1], seen.ids[:, 0]
-    unseen = ["no moving body is seen: ids and motions of bodies are not tested"]
+    unseen = "no moving body is seen: ids and motions of bodies are not tested"
     if not seen.has_rows:
-        return [], unseen, []
+        return "untested", unseen
     if int(ids.min()) < 0 or int(ids.max()) >= count:
         given = f"{int(ids.min())} to {int(ids.max())}"
-        return [f"instance has ids {given}, but instance_motion rows 0 to {count - 1}"], [], []
+        return "fault", f"instance has ids {given}, but instance_motion rows 0 to {count - 1}"
     moved = (seen.rows - seen.motion.unsqueeze(1)).abs().flatten(2).amax(-1) > 1e-4
     moving = moved.any(0).nonzero()[:, 0].tolist()  # rows that are nan don't count
     if moving and not (ids > 0).any():
-        doubt = f"bodies {moving[0]} to {moving[-1]} move, but no pixel of instance has their ids"
-        return [], [], [doubt]
+        which = f"{moving[0]} to {moving[-1]}"
+        return "doubt", f"bodies {which} move, but no pixel of instance has their ids"
     known = torch.where(seen.depth[:, 0].isfinite() & (ids > 0), ids, 0)
     sizes = functional.one_hot(known.flatten(1), count).sum(1)
     body, frame = (sizes.T[1:] >= _FEW_PIXELS).nonzero().T
     if not len(body):
-        return [], unseen, []
+        return "untested", unseen
     chosen = _spread(len(frame), _BODIES)
     frame, body = frame[chosen], body[chosen] + 1
     of_body = body[:, None, None]
@@ -252,7 +253,7 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[list[str], list[str], list[
     number = residual(pairs, pairs.motion).isfinite().sum((1, 2))
     tells = (torch.maximum(moved_px, left) >= _MOVED_PX) & (number >= _FEW_PIXELS)
     if int(tells.sum()) < _FEW_FRAMES:
-        return [], unseen, []
+        return "untested", unseen
     pairs, left, moved_px, body = pairs.of(tells), left[tells], moved_px[tells], body[tells]
     best = px_of(residual(pairs, best_motion(pairs, pairs.motion, still[tells])), 0.5)
     at_rest_px = px_of(residual(pairs, still[tells]), 0.5)
@@ -265,11 +266,11 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[list[str], list[str], list[
             size = f"{median(left[of]):.2g} px are left of {median(moved_px[of]):.2g} px"
             why = f"instance_motion or ids don't fit {says}: {size}"
             why += f", and a motion exists that would leave {median(best[of]):.2g} px"
-            return [why], [], []
+            return "fault", why
     # A flat body that moves aside changes no depth: it might as well be at rest.
     if int((at_rest_px > least).sum()) < _FEW_FRAMES:
-        return [], ["depth tells nothing: motions of bodies are not tested"], []
-    return [], [], []
+        return "untested", "depth tells nothing: motions of bodies are not tested"
+    return "", ""
 
 
 def _call(typed: str, corrected: Any) -> str:

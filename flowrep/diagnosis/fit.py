@@ -1,9 +1,9 @@
-"""What any motion of the camera leaves of a pair of frames, in pixels, and the motion of least."""
+"""How far camera motions are from explaining pairs of frames, in pixels, and the nearest motion."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from flowrep.geometry.egomotion import structure_tensor
-from flowrep.geometry.pose import rotation_from_vector
+from flowrep.geometry.pose import relative_motion, rotation_from_vector
 
 EYE = torch.eye(4, dtype=torch.float64)
 PIXELS, FITTED = 1000, 400  # of a pair, and of these, those that motions and numbers are fitted to
@@ -21,7 +21,7 @@ _STEP = 1e-6  # of numeric derivatives
 # Depth between pixels is exact on planes alone: round bodies leave 0.02 px of right data.
 INTERPOLATED_PX = 0.04
 PARTS = 6, 4  # columns and rows of a picture, in which noise evens out and bodies don't
-_DEARER = 5.0  # a pixel that agrees no longer counts as this many that begin to
+_DEARER = 5.0  # one pixel that stops agreeing counts as much as this many that begin to
 _SETTLED = 0.01  # a step that is too small to matter, in scales of all pixels' root of squares
 
 
@@ -51,12 +51,17 @@ class Pairs(NamedTuple):
         maps = [tensor[pairs][..., pixels] for tensor in self[:5]]
         return Pairs._make([*maps, *(tensor[pairs] for tensor in self[5:10]), *self[10:]])
 
+    @staticmethod
+    def joined(parts: Sequence[Pairs]) -> Pairs:
+        """Returns the pairs of all parts; of depth's steps the largest counts."""
+        maps = [torch.cat(tensors) for tensors in zip(*(part[:10] for part in parts))]
+        pairs = Pairs._make([*maps, *parts[0][10:]])
+        return pairs._replace(depth_step=max(part.depth_step for part in parts))
+
     @property
     def motion(self) -> Tensor:
         """The recorded one, `prev_from_curr` [P, 4, 4]."""
-        before, now = self.path[:, 1], self.path[:, 2]
-        turned = before[:, :3, :3].mT @ torch.cat([now[:, :3, :3], (now - before)[:, :3, 3:]], -1)
-        return torch.cat([turned, EYE[3:].expand(len(now), 1, 4)], 1)
+        return relative_motion(self.path[:, 1], self.path[:, 2], dtype=torch.float64)
 
     @property
     def has_poses(self) -> bool:
@@ -114,8 +119,8 @@ def sampled(
     scale_px = 0.5 if raw is None else 1e-4
     focal_px = float(K[:, 0, 0].median())
     numbers = (raw is not None, picture is not None, depth_step, scale_px, focal_px)
-    given = Pairs._field_defaults
-    return Pairs._make([*maps, *whole, *numbers, given["gain"], given["distortion"]])
+    fields: Any = [*maps, *whole, *numbers]
+    return Pairs(*fields)
 
 
 def seen_before(pairs: Pairs, motion: Tensor) -> tuple[Tensor, Tensor]:

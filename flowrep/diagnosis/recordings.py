@@ -40,9 +40,7 @@ class Examination:
 
     conventions: Mapping[str, str] = field(default_factory=dict)
     flow_is_recorded: bool = True
-    _parts: list[Pairs] = field(default_factory=list)
-    _starts: list[Tensor] = field(default_factory=list)
-    _names: list[str] = field(default_factory=list)
+    _seen: list[tuple[Pairs, Tensor, str]] = field(default_factory=list)  # motion, name
     _reasons: list[str] = field(default_factory=list)
     _stand: list[str] = field(default_factory=list)
     _intervals_s: list[float] = field(default_factory=list)
@@ -75,9 +73,7 @@ class Examination:
             return False
         options: Any = {"prev_K": prev_K.float(), "picture": picture}
         motion = geometry.camera_motion(flow, now[:, None], K.float(), **options).prev_from_curr
-        self._parts.append(pairs)
-        self._starts.append(motion.double())
-        self._names.append(current.name)
+        self._seen.append((pairs, motion.double(), current.name))
         if previous.timestamp_s is not None and current.timestamp_s is not None:
             self._intervals_s.append(current.timestamp_s - previous.timestamp_s)
         return True
@@ -85,17 +81,14 @@ class Examination:
     @torch.no_grad()
     def diagnosis(self) -> Diagnosis:
         """Returns the diagnosis of all pairs so far."""
-        if not self._parts:
+        if not self._seen:
             return nothing(self._reasons)
-        first = self._parts[0]
-        maps = [torch.cat(parts) for parts in zip(*(part[:10] for part in self._parts))]
-        pairs = Pairs._make([*maps, *first[10:]])
-        pairs = pairs._replace(depth_step=max(part.depth_step for part in self._parts))
+        parts, motions, names = zip(*self._seen)
         options = {"by_flow": True, "of_flow": self.flow_is_recorded, "absolute": True}
         rivals = rivals_of(self.conventions, **options)
-        starts = [torch.cat(self._starts)]
-        found = diagnosed(pairs, starts, rivals, self._names, self._remedy, self._stand)
-        return replace(found, notes=(*found.notes, *left_out(self._reasons, len(self._names))))
+        pairs, starts = Pairs.joined(parts), [torch.cat(motions)]
+        result = diagnosed(pairs, starts, rivals, names, self._remedy, self._stand)
+        return replace(result, notes=(*result.notes, *left_out(self._reasons, len(names))))
 
     def _remedy(self, typed: str, corrected: Pairs) -> str:
         words, given = typed.split(" "), self.conventions
@@ -127,11 +120,17 @@ def why_not(pairs: Pairs) -> list[str]:
         few = pairs.of(still, slice(FITTED))._replace(by_flow=False, scale_px=0.5)
         rest = fitted(few, best_motion(few, few.motion), few.has_poses)
         stands[still] = rest.shown > max(rest.least, _LEAST_MOVEMENT_PX)
-    return [
-        "depth is nowhere known" if not d else "too few pixels are known" if n < _LEAST_PIXELS else
-        "" if m else STANDS if s else "hardly anything moves"
-        for d, n, m, s in zip(*(x.tolist() for x in (has_depth, number, moves, stands)))
-    ]  # fmt: skip
+    return [_reason(*each) for each in zip(*map(Tensor.tolist, (has_depth, number, moves, stands)))]
+
+
+def _reason(has_depth: bool, number: int, moves: bool, stands: bool) -> str:
+    if not has_depth:
+        return "depth is nowhere known"
+    if number < _LEAST_PIXELS:
+        return "too few pixels are known"
+    if moves:
+        return ""
+    return STANDS if stands else "hardly anything moves"
 
 
 def left_out(reasons: Sequence[str], used: int) -> list[str]:

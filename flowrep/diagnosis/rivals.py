@@ -1,4 +1,4 @@
-"""The usual mistakes: a table of what data may be instead, and what makes right data of them."""
+"""A table of the usual mistakes, each with the change that corrects it."""
 
 from __future__ import annotations
 

@@ -25,7 +25,8 @@ from flowrep.diagnosis.fit import (
 )
 from flowrep.diagnosis.rivals import Rival
 
-# No error: rounding, a share of the noise, and of flow that was estimated, which is too short.
+# Smaller errors are none: rounding, a share of the noise, and of estimated flow, which is too
+# short.
 _EXACT_PX, _OF_NOISE, _OF_ESTIMATED = 2e-3, 0.3, 0.03
 # What explains an error leaves several times less, or clearly less in most of many pairs.
 _SEVERAL, _CLEARLY, _MANY_PAIRS = 3.0, 1.7, 8
@@ -37,8 +38,8 @@ _EXPLAINED = 0.25  # what an explanation leaves at most
 _ROUGH, _ROUGH_WIDTHS, _TIMES_THE_NOISE, _LITTLE = 0.25, 1 / 1280, 20.0, 0.02
 _UNSURE = 0.15  # right data would be right to that alone
 _DOUBTFUL, _DOUBTFUL_PX = 0.15, 0.15  # left by the best motion: the flow's estimator failed
-# Pairs that don't fit the others err by these times the median, and this share of their flow; as
-# this share of all pairs they are a mistake in a part of the recording.
+# A stray pair errs by more than `_STRAY` times the median and `_STRAY_SHARE` of its flow. If
+# `_MANY_STRAYS` of all pairs are stray, a part of the recording is wrong.
 _STRAY, _STRAY_SHARE, _MANY_STRAYS = 4.0, 0.04, 0.2
 _OFF, _OFF_PX, _OFF_SHARE = 3.0, 0.1, 0.03  # pixels that don't fit: in scales, and their share
 # Pixels that fit if the largest depth is added: a share that is named, one that is a mistake, and
@@ -197,7 +198,7 @@ def diagnosed(
     return Diagnosis("right", agree, **numbers, unseen=unseen, notes=tuple(notes))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Fit:
     """What the data leave, as they are or as a rival corrects them, px `[P]`.
 
@@ -368,9 +369,9 @@ def _learnt(few: Pairs, rival: Rival, best: Tensor) -> Tensor | None:
         follows = (few.path[1:, 1] == few.path[:-1, 2]).flatten(1).all(1)
         if not follows.any():
             return None
-        fitted, n = n, n.clone()
-        n[:-1, 0] = torch.where(follows, fitted[1:, 1], fitted[:-1, 0])
-        n[1:, 1] = torch.where(follows, fitted[:-1, 0], fitted[1:, 1])
+        frames, n = n, n.clone()
+        n[:-1, 0] = torch.where(follows, frames[1:, 1], frames[:-1, 0])
+        n[1:, 1] = torch.where(follows, frames[:-1, 0], frames[1:, 1])
     else:
         halves = [min(tries, key=lambda tried: tried[1][i])[0][i] for i in half.unique()]
         n = torch.stack(halves)[half.max() - half]
@@ -383,15 +384,15 @@ def _learnt(few: Pairs, rival: Rival, best: Tensor) -> Tensor | None:
 
 def _able(others: Sequence[_Fit], before: Tensor, noise: Tensor, raw_px: float) -> list[_Fit]:
     """Returns the rivals that explain errors, the best first."""
-    after = {id(each): median(each.beyond(noise)) for each in others}
-    error, ranked = median(before), sorted(others, key=lambda each: after[id(each)])
+    after = {each: median(each.beyond(noise)) for each in others}
+    error, ranked = median(before), sorted(others, key=lambda each: after[each])
     most = min(error, _EXPLAINED * raw_px) if error > _LARGE * raw_px else error / _SEVERAL
-    able = [each for each in ranked if after[id(each)] < most]
+    able = [each for each in ranked if after[each] < most]
     able = [each for each in able if is_better(each.beyond(noise), before)]
     if not able:
         return []
-    enough = min(_CLEARLY * after[id(able[0])] + able[0].floor, error / _CLEARLY)
-    able = [each for each in ranked if after[id(each)] <= enough]
+    enough = min(_CLEARLY * after[able[0]] + able[0].floor, error / _CLEARLY)
+    able = [each for each in ranked if after[each] <= enough]
     # One that learns more numbers than another of its kind says the same with more words.
     fewest = {each.rival.of: len(each.n) for each in sorted(able, key=lambda e: -len(e.n))}
     return [each for each in able if len(each.n) == fewest[each.rival.of]]

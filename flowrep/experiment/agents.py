@@ -86,7 +86,7 @@ class Agent(Driver):
         """
         if "resume" in overrides:
             raise UsageError("resume=: continue a run with python -m flowrep.train resume=<folder>")
-        config, default, typed = composed("train", overrides, TrainConfig)
+        config, default, typed = composed(overrides)
         run = RunFolder(default if folder is None else folder)
         run.check_is_new()
         with (
@@ -150,7 +150,7 @@ class Agent(Driver):
             maps = dict(representations or {})
         else:
             names = {"representations": [*representations]}
-            maps = composed("train", names, TrainConfig)[0].representations
+            maps = composed(names)[0].representations
         if kind != "external":
             # A `_target_` alone only trusts a class that a run names; `trusted` has it.
             chosen = [each for each in maps.values() if {*(each or {})} != {"_target_"}] or None
@@ -167,12 +167,9 @@ class Agent(Driver):
             config = _config_without_run(given_scene, maps if kind == "external" else {}, values)
             return cls(_external(name, config) if kind == "external" else name, config)
         trained, frames, weights = _stored(name, given_scene, trusted)
-        section = trained.algorithm
-        if precision is not None and hasattr(build.algorithm(section)[1], "precision"):
-            machine["algorithm"] = section.model_copy(update={"precision": precision})
         if given_scene is not None:
             machine["scene"] = replace(given_scene, camera=trained.scene.camera)
-        config = trained.model_copy(update=machine)
+        config = build.with_precision(trained.model_copy(update=machine), precision)
         with closing(build.env(config, num_envs=1, num_workers=0)) as env:
             policy = build.policy(config, env)
         try:

@@ -52,8 +52,7 @@ def env(config: EnvConfig, **changes: Any) -> EnvBase:
     }
     arguments |= changes | {"num_workers": num_workers}
     maps = arguments["representations"]
-    if isinstance(maps, Mapping):
-        arguments["representations"] = {name: _options(name, maps[name]) for name in maps}
+    arguments["representations"] = {name: _described(name, maps[name]) for name in maps}
     return make_env(**arguments).append_transform(InitTracker())
 
 
@@ -93,10 +92,12 @@ def check_classes(config: TrainConfig) -> None:
     """Checks that the classes that a config names exist and accept their options."""
     algorithm(config.algorithm)
     for name, options in config.representations.items():
-        _options(name, options)
+        _described(name, options)
 
 
-def _options(name: str, options: Mapping[str, Any] | None) -> Mapping[str, Any] | Transform | None:
+def _described(
+    name: str, options: Mapping[str, Any] | None
+) -> Mapping[str, Any] | Transform | None:
     """Returns a representation's options, or the user's transform that they describe."""
     if not options or "_target_" not in options:
         return options
@@ -123,13 +124,14 @@ def _class(key: str, target: str, base: type) -> Any:
     return named
 
 
-def with_precision(config: TrainConfig) -> TrainConfig:
-    """Returns a new run's config with `precision=auto` replaced by this machine's choice."""
+def with_precision(config: TrainConfig, precision: str | None = None) -> TrainConfig:
+    """Returns a config with this precision, or its own; "auto" is replaced by this machine's."""
     section = config.algorithm
     _, options = algorithm(section)
     if not hasattr(options, "precision"):  # of a user's algorithm
         return config
-    chosen = {"precision": resolved_precision(options.precision, device(config.device))}
+    name = options.precision if precision is None else precision
+    chosen = {"precision": resolved_precision(name, device(config.device))}
     return config.model_copy(update={"algorithm": section.model_copy(update=chosen)})
 
 

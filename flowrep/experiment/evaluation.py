@@ -271,7 +271,7 @@ class PairedEvaluation:
     ) -> Iterator[EpisodeRecord]:
         """Yields the missing episodes."""
         for rate in self.fps:
-            own = _BLIND if isinstance(policy, str) else {}  # a baseline, too
+            own = _BLIND if isinstance(policy, str) else {}  # the policy itself may be a baseline
             for names, changes in ((self.policies, own), (self.baselines, _BLIND)):
                 jobs = {name: self._job(name, policy, rate) for name in names}
                 most = max((len(job["episodes"]) for job in jobs.values()), default=0)

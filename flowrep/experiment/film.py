@@ -2,7 +2,7 @@
 
 import math
 import textwrap
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from itertools import repeat
@@ -23,7 +23,6 @@ from flowrep.experiment.evaluation import Driver, evaluate
 from flowrep.experiment.outcomes import EpisodeRecord
 from flowrep.files import replace_file
 from flowrep.scenes.vehicle import YAW_SIGN
-from flowrep.simulator.camera import choose_renderer
 from flowrep.transforms import representation_stack
 from flowrep.transforms.stack import FLOWS, REPRESENTATIONS, representation_options
 from flowrep.viz import (
@@ -34,7 +33,6 @@ from flowrep.viz import (
     grey_to_rgb,
     representation_strip,
     stock_tiles,
-    strip,
     write_video,
 )
 from flowrep.viz.maps import OUTCOME_COLOURS, class_legend, resized, text_bar, tile_zoom, written
@@ -143,9 +141,14 @@ class Film:
     def draw(self, frame: FilmFrame, ended: EpisodeRecord | None = None) -> Image:
         """Returns a frame's picture, with the outcome of the episode if it has `ended`."""
         tiles = dict(self.tiles)
-        if "rgb" in tiles:
+        if rgb := tiles.get("rgb"):
             sign = 0.0 if frame.action is None else YAW_SIGN[frame.action]
-            tiles["rgb"] = self._with_steering(frame.turned, sign)
+
+            def draw(picture: Tensor) -> Image:
+                enlarged = resized(rgb.draw(picture), *self._tile_size)
+                return with_steering(enlarged, frame.turned, sign)
+
+            tiles["rgb"] = rgb._replace(draw=draw)
         classes = self.street.scene.categories
         drawn = representation_strip(
             frame.maps, tiles=tiles, framed=self.framed, categories=classes
@@ -159,9 +162,14 @@ class Film:
         """Returns a picture, as large as the frames' pictures, that explains them."""
         classes = self.street.scene.categories
         keys = {"rgb": steering(0.3, 1.0), "seg": class_legend(classes, self._tile_size[1])}
-        drawn = legend_strip(
-            self.tiles, self._tile_size, keys=keys, framed=self.framed, categories=classes
-        )
+        wheel = flow_wheel(min(self._tile_size) // 2)
+        pages = {}
+        for name, tile in self.tiles.items():
+            key = wheel if tile.is_flow else keys.get(name)
+            draw = partial(_page, self._tile_size, key=key)
+            pages[name] = tile._replace(draw=draw, is_flow=False)
+        texts = {name: tile.about for name, tile in self.tiles.items()}
+        drawn = representation_strip(texts, tiles=pages, framed=self.framed, categories=classes)
         name = self.agent.policy if isinstance(self.agent.policy, str) else "the agent"
         if self.framed:
             return _above(drawn, f"framed: what {name} reads; the other maps are exact")
@@ -177,14 +185,6 @@ class Film:
     def close(self) -> None:
         """Closes the env."""
         self.env.close()
-
-    def _with_steering(self, turned: float, sign: float) -> Tile:
-        tile = self.tiles["rgb"]
-
-        def draw(rgb: Tensor) -> Image:
-            return with_steering(resized(tile.draw(rgb), *self._tile_size), turned, sign)
-
-        return tile._replace(draw=draw)
 
     def _options(self, name: str) -> dict[str, Any]:
         if name not in REPRESENTATIONS:  # a user's transform, whose options may mean anything
@@ -255,7 +255,7 @@ def _picture_scale(agent: Driver) -> int:
     pictures of the config's size in any case.
     """
     config = agent.config
-    if "rgb" in config.representations or choose_renderer(config.renderer) == "pybullet":
+    if "rgb" in config.representations or config.renderer == "pybullet":
         return 1
     return tile_zoom(config.scene.camera.height_px, config.scene.camera.width_px)
 
@@ -320,34 +320,6 @@ def with_steering(image: Image, turned: float, sign: float = 0.0) -> Image:
     image = image.copy()
     image[area] = steering(turned, sign, image[area])
     return image
-
-
-def legend_strip(
-    tiles: Mapping[str, Tile],
-    size: tuple[int, int],
-    *,
-    keys: Mapping[str, Image],
-    framed: Collection[str] = (),
-    categories: Iterable[str] = (),
-) -> Image:
-    """Returns a strip whose tiles explain what a strip of the same size shows.
-
-    Args:
-        tiles: those of the strip, by name.
-        size: height and width of its tiles.
-        keys: by name, a picture below the explanation; flow has the wheel of its colours.
-        framed: names of tiles with a frame.
-        categories: classes whose colours are explained below.
-    """
-    wheel = flow_wheel(min(size) // 2)
-    pages = {
-        tile.label: _page(size, tile.about, wheel if tile.is_flow else keys.get(name))
-        for name, tile in tiles.items()
-    }
-    notes = {tile.label: tile.note for tile in tiles.values() if tile.note}
-    labels = [tile.label for name, tile in tiles.items() if name in framed]
-    drawn = strip(pages, notes=notes, framed=labels)
-    return np.concatenate([drawn, class_legend(tuple(categories), drawn.shape[1])])
 
 
 def _page(size: tuple[int, int], text: str, key: Image | None) -> Image:

@@ -85,7 +85,7 @@ def read_episodes(path: Path) -> list[dict[str, str]]:
 
 def is_finished(folder: Path, config: TrainConfig) -> bool:
     """Returns whether a run's final evaluation is in its folder."""
-    frames = [int(row["frames"]) for row in _final(folder)]
+    frames = [int(row["frames"]) for row in _final_rows(folder)]
     enough = sum(each >= config.total_frames for each in frames)
     return enough >= config.evaluation.final_total
 
@@ -95,7 +95,7 @@ def success_of(folder: Path) -> float:
 
     It is that of greedy actions, or of sampled ones if these alone were evaluated.
     """
-    rows = _final(folder)
+    rows = _final_rows(folder)
     for policy in ("greedy", "sampled"):
         acted = [row for row in rows if row["policy"] == policy]
         last = max((int(row["frames"]) for row in acted), default=0)
@@ -104,14 +104,14 @@ def success_of(folder: Path) -> float:
     return float("nan")
 
 
-def _final(folder: Path) -> list[dict[str, str]]:
+def _final_rows(folder: Path) -> list[dict[str, str]]:
     rows = read_episodes(folder / "evaluation.csv")
     return [row for row in rows if row["evaluation"] == "final"]
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     """Returns Wilson's 95 % score interval of a proportion; (0, 1) without trials."""
-    # Reports take it from scipy, which a training needn't have installed.
+    # not scipy's, which a training needn't have installed
     if not trials:
         return 0.0, 1.0
     # the proportions p from which the observed share is at most z standard errors away: the

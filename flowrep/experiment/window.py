@@ -1,7 +1,6 @@
 """A window in which a policy drives, or a person by the arrow keys."""
 
 import time
-from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from itertools import cycle
@@ -12,7 +11,7 @@ from tensordict import TensorDictBase
 
 from flowrep.config import UsageError
 from flowrep.experiment.evaluation import Policy, evaluate
-from flowrep.experiment.film import Film, FilmFrame, how_it_ended
+from flowrep.experiment.film import Film, how_it_ended
 from flowrep.scenes.vehicle import NO_OP, TURN_LEFT, TURN_RIGHT
 
 
@@ -109,7 +108,9 @@ def drive_in_window(
     axes = figure.add_axes((0, 0, 1, 0.92))
     axes.set_axis_off()
     title = figure.suptitle("", fontfamily="monospace", fontsize=10)
-    image, drawn_at = None, time.monotonic()
+    image: Any = None
+    frame: Any = None
+    drawn_at = time.monotonic()
 
     def show(picture: Any) -> None:
         nonlocal image
@@ -117,18 +118,17 @@ def drive_in_window(
         image.set_data(picture)
 
     def draw(tensordict: TensorDictBase) -> None:
-        nonlocal drawn_at
+        nonlocal frame, drawn_at
         if keyboard.is_over or keyboard.is_new:
             raise NewEpisode
-        latest.append(film.frame(tensordict))
-        show(film.draw(latest[-1]))
+        frame = film.frame(tensordict)
+        show(film.draw(frame))
         title.set_text(f"{keyboard.driver} drives    {keyboard.HELP}")
         pause(max(1e-3, 1 / film.street.frame_rate_hz - (time.monotonic() - drawn_at)))
         drawn_at = time.monotonic()
 
-    latest: deque[FilmFrame] = deque(maxlen=1)
     (episode,) = evaluate(film.env, keyboard, [options], on_frame=draw)
-    show(film.draw(latest[-1], episode))
+    show(film.draw(frame, episode))
     title.set_text(f"{how_it_ended(episode)}    {keyboard.HELP}")
     while not (keyboard.is_over or keyboard.is_new):
         pause(0.05)

@@ -72,12 +72,10 @@ class Run:
         if len(while_training):  # the scene may have changed since, under the same name
             here &= e["scene_id"] == while_training[0]
         here &= (e["evaluation"] != "training") & (e["frames"] >= self.total_frames)
-        latest = np.flatnonzero(here)
-        latest = latest[np.argsort(-e["frames"][latest], kind="stable")]
-        cells = (e[name][latest].tolist() for name in (*Condition._fields, "episode_seed"))
-        once: dict[Any, int] = {}
-        for row, episode in zip(latest.tolist(), zip(*cells)):
-            once.setdefault(episode, row)
+        rows = np.flatnonzero(here)
+        rows = rows[np.argsort(e["frames"][rows], kind="stable")]
+        cells = (e[name][rows].tolist() for name in (*Condition._fields, "episode_seed"))
+        once = dict(zip(zip(*cells), rows.tolist()))  # the row of the most frames is the last
         here[:] = False
         here[[*once.values()]] = True
         return here
@@ -230,7 +228,7 @@ def changes(runs: Iterable[Run], before: Condition, after: Condition) -> Array:
         return success_rate(outcomes[1:]) - success_rate(outcomes[:1])
 
     pairs = [paired_scores([[run]], (before, after), change) for run in runs]
-    return np.array([pair[0][0][0] for pair in pairs if pair])
+    return np.array([scores[0] for (scores,), _ in filter(None, pairs)])
 
 
 def baseline_share(runs: Iterable[Run], condition: Condition) -> float | None:

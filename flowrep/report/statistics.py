@@ -16,6 +16,8 @@ import numpy as np
 import scipy  # its parts load at first use: a mistyped folder need not wait for them
 from numpy.typing import NDArray
 
+from flowrep.experiment.outcomes import wilson_interval
+
 Array = NDArray[np.float64]
 
 LEVEL = 0.05  # of tests; intervals cover 1 - LEVEL
@@ -130,8 +132,8 @@ def mean_share(scenes: Sequence[Array], episodes: int = 0) -> Estimate:
     """
     mean = effect([(rates,) for rates in scenes])
     if episodes and not mean.error > 0:
-        test = scipy.stats.binomtest(round(mean.value * episodes), episodes)
-        return Estimate(mean.value, *test.proportion_ci(1 - LEVEL, method="wilson"))
+        successes = round(mean.value * episodes)
+        return Estimate(mean.value, *wilson_interval(successes, episodes))
     value, low, high = mean.interval()
     return Estimate(value, max(low, 0.0), min(high, 1.0))
 

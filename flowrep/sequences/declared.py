@@ -118,8 +118,7 @@ class DeclaredRecording(Recording):
         self._choose(left_out)
         self._made: dict[Any, tuple[Any, Any]] = {}
         unit_m = self.depth_unit_m or files.usual_unit_m(files.read_array(self._depths[0]))
-        named = ["pose_layout", "pose_direction", "pose_axes", "depth_kind"]
-        named += ["flow_direction", "flow_channels"]
+        named = "pose_direction", "pose_axes", "depth_kind", "flow_direction", "flow_channels"
         self.conventions = {name: getattr(self, name) for name in named}
         self.conventions |= {"depth_unit_m": str(unit_m)}
 
@@ -353,10 +352,9 @@ class DeclaredRecording(Recording):
             register = self._once(
                 calibration.Registration, K_depth, K, self._colour_from_depth, size
             )
-            depth, pose = (
-                register(depth),
-                pose if pose is None else pose @ register.depth_from_colour,
-            )
+            depth = register(depth)
+            if pose is not None:
+                pose = pose @ register.depth_from_colour
         if self.distortion:
             rectify = self._once(calibration.Undistortion, K, self.distortion, self.lens, size)
             rgb = None if rgb is None else rectify(rgb)

@@ -90,9 +90,9 @@ def read_table(path: Path) -> NDArray[np.float64]:
     path = path.with_name(name)
     try:
         if path.suffix.lower() == ".json":
-            parts = []
+            parts, whole = [], json.loads(regular(path).read_bytes())
             for steps in keys.split("+"):
-                value = json.loads(regular(path).read_bytes())
+                value = whole
                 for step in steps.split("."):
                     value = value[int(step)] if isinstance(value, list) else value[step]
                 parts.append(np.array(value, dtype=np.float64))

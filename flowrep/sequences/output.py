@@ -117,9 +117,7 @@ class Output:
             if "kitti" in self.flow_files:
                 write_kitti_flow(self._file(f"flow/{kind}/{name}.png"), flow)
             if self.pictures_every and index % self.pictures_every == 0:
-                label, scale_px = f"{kind} flow", self.scale_px[kind]
-                colours, notes = viz.flow_to_rgb(flow, scale_px), {label: viz.flow_note(scale_px)}
-                picture = viz.strip({label: colours}, wheel_for=[label], notes=notes)
+                picture = viz.representation_strip({kind: flow}, flow_scale_px=self.scale_px)
                 write_picture(self._file(f"pictures/{kind}/{name}.png"), picture)
         if "npz" in self.flow_files:
             contents: Any = {

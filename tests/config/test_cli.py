@@ -351,18 +351,18 @@ def test_a_command_ends_with_one_line_and_code_2(tmp_path):
 @pytest.mark.parametrize("group", ["experiment", "debug"])
 def test_a_misspelt_choice_of_an_optional_group_is_refused(group):
     with pytest.raises(UsageError, match=f"unknown {group} 'smok'"):
-        cli.composed("train", {group: "smok"}, schema.TrainConfig)
+        cli.composed({group: "smok"})
 
 
 def test_a_mapping_of_representations_is_the_whole_stack():
     values = {"debug": "smoke", "representations": {"obj": {"scale": 0.5}}}
-    config, _, _ = cli.composed("train", values, schema.TrainConfig)
+    config, _, _ = cli.composed(values)
     assert {name: of["scale"] for name, of in config.representations.items()} == {"obj": 0.5}
 
 
 def test_a_config_can_be_composed_in_a_script_that_uses_hydra_itself(tmp_path):
     with initialize_config_dir(str(tmp_path), version_base="1.3"):
-        config, _, _ = cli.composed("train", {"debug": "smoke"}, schema.TrainConfig)
+        config, _, _ = cli.composed({"debug": "smoke"})
         assert config.total_frames > 0
         assert GlobalHydra.instance().is_initialized()
     assert not GlobalHydra.instance().is_initialized()
