@@ -28,7 +28,7 @@ FLOWREP_IMPORTS_ALLOWED = {
     | {"files", "options", "yaml_file"},
     "progress": set(),
     "tables": {"files"},
-    "viz": {"viz", "scenes", "geometry"},
+    "viz": {"viz", "scenes", "geometry", "files"},
     "sequences": {"sequences", "config", "progress", "tables", "extras"}
     | {"transforms", "geometry", "viz", "diagnosis"},
     "config": {"config", "options", "scenes", "yaml_file"},

@@ -170,22 +170,10 @@ def diagnosed(
         if not pairs.is_coarse:
             why = f"{size} are left, by rough poses or a mistake that {len(errors)} pairs hide"
         return Diagnosis("can't tell", why, **numbers)
-    notes = [f"{steps} smaller errors"] if pairs.is_coarse else []
-    inverse = pairs.now[pairs.now > 0]
-    farthest = float(inverse.amin().reciprocal()) if len(inverse) else 0.0
-    share = float((inverse == inverse.amin()).double().mean()) if len(inverse) else 0.0
-    if share > _FARTHEST:
-        notes.append(f"{share:.0%} of depth is {farthest:.4g} m: if that is no surface, say so")
-    if pairs.by_flow:
-        off_share, wrapped_share = _off(pairs, motion, farthest)
-        if wrapped_share > _WRAPPED_SHARE:
-            why = f"{wrapped_share:.0%} of the pixels fit if {farthest:.5g} m are added to depth"
-            why += ": it wraps around there, as 16 bits of millimetres do at 65.536 m"
-            if wrapped_share > _MANY_WRAPPED:
-                return Diagnosis("something is wrong", why, **numbers)
-            notes.append(why)
-        if off_share > _OFF_SHARE:
-            notes.append(f"{off_share:.0%} of pixels don't fit: they move, or depth is wrong there")
+    why, of_depth = _about_depth(pairs, motion)
+    if why:
+        return Diagnosis("something is wrong", why, **numbers)
+    notes = [*[f"{steps} smaller errors"] * pairs.is_coarse, *of_depth]
     if stray:
         notes.append(f"poses that don't fit the others: {', '.join(stray)}")
     if not pairs.has_poses:
@@ -417,6 +405,27 @@ def _other_times(recorded: _Fit, raw_px: float) -> str:
     if median(shares[1] / shares[0]) > _CROWD:
         return ""
     return f"depth moves otherwise than flow, by {px:.2g} px of {raw_px:.2g} px: is it of one time?"
+
+
+def _about_depth(pairs: Pairs, motion: Tensor) -> tuple[str, list[str]]:
+    """Returns in which way depth is wrong where it is largest, or "", and notes on depth."""
+    inverse, notes = pairs.now[pairs.now > 0], []
+    farthest = float(inverse.amin().reciprocal()) if len(inverse) else 0.0
+    share = float((inverse == inverse.amin()).double().mean()) if len(inverse) else 0.0
+    if share > _FARTHEST:
+        notes.append(f"{share:.0%} of depth is {farthest:.4g} m: if that is no surface, say so")
+    if not pairs.by_flow:
+        return "", notes
+    off_share, wrapped_share = _off(pairs, motion, farthest)
+    if wrapped_share > _WRAPPED_SHARE:
+        why = f"{wrapped_share:.0%} of the pixels fit if {farthest:.5g} m are added to depth"
+        why += ": it wraps around there, as 16 bits of millimetres do at 65.536 m"
+        if wrapped_share > _MANY_WRAPPED:
+            return why, notes
+        notes.append(why)
+    if off_share > _OFF_SHARE:
+        notes.append(f"{off_share:.0%} of pixels don't fit: they move, or depth is wrong there")
+    return "", notes
 
 
 def _off(pairs: Pairs, motion: Tensor, farthest: float) -> tuple[float, float]:

@@ -21,7 +21,6 @@ from flowrep.baselines import BaselinePolicy
 from flowrep.envs import street_envs
 from flowrep.experiment.evaluation import Driver, evaluate
 from flowrep.experiment.outcomes import EpisodeRecord
-from flowrep.files import replace_file
 from flowrep.scenes.vehicle import YAW_SIGN
 from flowrep.transforms import representation_stack
 from flowrep.transforms.stack import FLOWS, REPRESENTATIONS, representation_options
@@ -235,8 +234,7 @@ def record_episode(
     with closing(Film(agent, **changes)) as film:
         frames, episode = film.drive({"episode_seed": episode_seed})
         pictures = film.pictures(frames, episode)
-        path.parent.mkdir(exist_ok=True)
-        replace_file(path, partial(write_video, frames=pictures, fps=episode.fps))
+        write_video(path, pictures, fps=episode.fps)
     return episode
 
 

@@ -1,18 +1,19 @@
-"""Videos; an mp4 gets its name only when it is complete."""
+"""Videos as mp4 files, frame by frame or whole."""
 
 from __future__ import annotations
 
+import errno
 import subprocess
 import tempfile
 from collections.abc import Iterable
-from contextlib import suppress
+from contextlib import closing, suppress
 from fractions import Fraction
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 
+from flowrep.files import replace_file
 from flowrep.viz.maps import Image
 
 # Constant quality, nearly lossless. `veryfast` takes half the time of x264's default, at the same
@@ -21,10 +22,10 @@ _CODEC = ("-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "10", "-preset", "ve
 
 
 class Video:
-    """An mp4 (H.264) that browsers play, written frame by frame; its folder is created if needed.
+    """An mp4 (H.264) that browsers play, written frame by frame.
 
-    The file gets its name when it is complete. Odd sizes, which the codec does not support, are
-    padded with a white row or column. Frames of other sizes than the first are cut or padded.
+    Odd sizes, which the codec does not support, are padded with a white row or column. Frames of
+    other sizes than the first are cut or padded.
 
     It starts FFmpeg itself, because imageio's writer ignores FFmpeg's exit status, and so a full
     disk.
@@ -35,7 +36,6 @@ class Video:
 
     def __init__(self, path: str | Path, *, fps: float) -> None:
         self.path, self.fps = Path(path), fps
-        self._partial = self.path.with_name(f"{self.path.stem}.tmp{self.path.suffix}")
         self._size = 0, 0
         self._ffmpeg: Any = None  # the process, once it has started, and the file of its messages
         self._messages: Any = None
@@ -60,37 +60,18 @@ class Video:
         if self._ffmpeg is None:
             return
         status, said = self._end()
-        if status or not self._partial.is_file():
-            self._partial.unlink(missing_ok=True)
-            raise OSError(f"{self.path} can't be written: {said or f'FFmpeg ended with {status}'}")
-        self._partial.replace(self.path)
-
-    def discard(self) -> None:
-        """Stops FFmpeg and deletes the partial file."""
-        if self._ffmpeg is not None:
-            self._ffmpeg.kill()
-            self._end()
-            self._partial.unlink(missing_ok=True)
-
-    def __enter__(self) -> Video:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, _: Any, __: TracebackType | None) -> None:
-        if kind is None:
-            self.close()
-        else:
-            self.discard()
+        if status or not self.path.is_file():
+            raise OSError(errno.EIO, said or f"FFmpeg ended with {status}", str(self.path))
 
     def _start(self, height: int, width: int) -> None:
         from imageio_ffmpeg import get_ffmpeg_exe
 
         self._size = height, width
-        self.path.parent.mkdir(parents=True, exist_ok=True)
         rate = str(Fraction(self.fps).limit_denominator())
         raw = ("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", rate)
         self._messages = tempfile.TemporaryFile()  # noqa: SIM115 - closed with FFmpeg
         self._ffmpeg = subprocess.Popen(
-            [get_ffmpeg_exe(), "-y", "-v", "error", *raw, "-i", "-", *_CODEC, str(self._partial)],
+            [get_ffmpeg_exe(), "-y", "-v", "error", *raw, "-i", "-", *_CODEC, str(self.path)],
             stdin=subprocess.PIPE,
             stderr=self._messages,
             start_new_session=True,  # so that Ctrl-C doesn't end it before this process can
@@ -109,10 +90,18 @@ class Video:
 
 
 def write_video(path: str | Path, frames: Iterable[Image], *, fps: float) -> None:
-    """Writes frames `[H, W, 3]` as an mp4, see `Video`."""
-    with Video(path, fps=fps) as video:
-        for frame in frames:
-            video.append(frame)
+    """Writes frames `[H, W, 3]` as an mp4, see `Video`; its folder is created if needed.
+
+    The file appears when it is complete, in place of an earlier one.
+    """
+
+    def write(partial: Path) -> None:
+        with closing(Video(partial, fps=fps)) as video:
+            for frame in frames:
+                video.append(frame)
+
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    replace_file(Path(path), write)
 
 
 def is_playable(path: str | Path) -> bool:

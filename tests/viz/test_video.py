@@ -62,7 +62,8 @@ def test_an_interrupted_film_is_not_there(tmp_path):
 
 
 def test_without_frames_there_is_no_file(tmp_path):
-    viz.write_video(tmp_path / "episode.mp4", [], fps=12)
+    with pytest.raises(OSError, match=r"episode\.mp4"):
+        viz.write_video(tmp_path / "episode.mp4", [], fps=12)
     assert not [*tmp_path.iterdir()]
 
 
