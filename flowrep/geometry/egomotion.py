@@ -34,6 +34,7 @@ from torch.nn import functional
 
 from flowrep.geometry.checks import check_shape, common_batch
 from flowrep.geometry.closed_form import LARGEST, MIN_DEPTH_RATIO, SMALLEST, known_camera
+from flowrep.geometry.pose import without_autocast
 
 VOTERS = 1 << 15  # pixels in the final choice; a share of so many is accurate to 1 %
 PIXELS = 1536  # pixels in a Gauss-Newton step; more don't improve the motion
@@ -117,6 +118,7 @@ class _Samples(NamedTuple):
 
 
 @torch.no_grad()
+@without_autocast
 def camera_motion(
     flow: Tensor,
     depth: Tensor,

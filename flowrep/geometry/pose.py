@@ -5,13 +5,18 @@ A matrix is named `<to>_from_<from>`, so that neighbours in a product cancel.
 
 from __future__ import annotations
 
+import functools
 import math
-from typing import Literal, TypeAlias
+from collections.abc import Callable
+from typing import Literal, ParamSpec, TypeAlias, TypeVar
 
 import torch
 from torch import Tensor
 
 from flowrep.geometry.checks import check_name, check_shape, common_batch, first_wrong, over_points
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 PoseLayout: TypeAlias = Literal[
     "matrix", "matrix_3x4", "xyz_xyzw", "xyz_wxyz", "xyz_yaw", "xyz_yaw_pitch"
@@ -37,6 +42,19 @@ _OPENCV_AXES = {
 _OPPOSITE_WORLD_AXIS = {"unreal": 1, "unity": 2}
 
 
+def without_autocast(function: Callable[P, R]) -> Callable[P, R]:
+    """Lets a function compute as without autocast, which would round metres to bfloat16."""
+
+    @functools.wraps(function)
+    def exact(*args: P.args, **kwargs: P.kwargs) -> R:
+        kinds = {x.device.type for x in (*args, *kwargs.values()) if isinstance(x, Tensor)}
+        with torch.autocast("cuda" if "cuda" in kinds else "cpu", enabled=False):
+            return function(*args, **kwargs)
+
+    return exact
+
+
+@without_autocast
 def invert_rigid(a_from_b: Tensor) -> Tensor:
     """Returns `b_from_a`, the inverse of a rotation and translation, `[*B, 4, 4]` each.
 
@@ -204,6 +222,7 @@ def check_rigid(name: str, a_from_b: Tensor, *, tolerance: float = 1e-3) -> None
             raise ValueError(f"{where} {complaint}; got {a_from_b[index].tolist()}")
 
 
+@without_autocast
 def transform_points(a_from_b: Tensor, points_b: Tensor) -> Tensor:
     """Returns points `[*B, ..., 3]` in coordinates a, in the wider of the two float types.
 

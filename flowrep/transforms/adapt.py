@@ -21,7 +21,7 @@ from flowrep.geometry.flow import check_flow_options
 from flowrep.geometry.pose import POSE_SHAPES, check_pose_options
 from flowrep.transforms import base
 from flowrep.transforms.base import Keys, MapTransform, Reads, check_distinct_keys, flags_of_batch
-from flowrep.transforms.flow import CameraTransform, Intrinsics
+from flowrep.transforms.flow import CameraTransform, Intrinsics, masked_flow
 
 
 class AdaptDepth(CameraTransform):
@@ -49,6 +49,7 @@ class AdaptDepth(CameraTransform):
     """
 
     reads_previous_frame = False
+    needs_camera = False
 
     def __init__(
         self,
@@ -76,6 +77,7 @@ class AdaptDepth(CameraTransform):
     def compute(self, depth: Tensor, K: Tensor | None = None) -> tuple[Tensor]:
         """Returns depth along the optical axis."""
         depth = depth.movedim(-1, -3) if self.channels_last else depth
+        depth = depth.to(base.signed(depth.dtype))
         return (geometry.adapt_depth(depth, K=self.K if K is None else K, **self.options),)
 
     def output_specs(self, depth: TensorSpec, *camera: TensorSpec) -> tuple[TensorSpec]:
@@ -179,6 +181,9 @@ class AdaptFlow(MapTransform):
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
     | flow | `"raw"` | float `[*B, 2, H, W]` | any | px/step |
+    | `"flow_valid"`, if there | | | | |
+
+    Where flow's mask is False, raw is nan, which `FlowFactorize` takes as unknown.
 
     Convention and further arguments: see `flowrep.geometry.adapt_flow`.
 
@@ -212,6 +217,12 @@ class AdaptFlow(MapTransform):
         check_distinct_keys(self)
         self.options: dict[str, Any] = {"direction": direction, "grid": grid, "channels": channels}
         self.channels_last = channels_last
+
+    def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
+        (flow,) = super()._read(tensordict)
+        if self.channels_last:
+            return [flow]
+        return [masked_flow(flow, self.in_keys[0], tensordict)]
 
     def compute(self, flow: Tensor) -> tuple[Tensor]:
         """Returns flow in flowrep's convention."""

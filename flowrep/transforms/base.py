@@ -13,7 +13,7 @@ from tensordict.nn import dispatch
 from tensordict.utils import NestedKey, expand_as_right
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
-from torchrl.envs.transforms import Transform
+from torchrl.envs.transforms import Compose, Transform
 
 # One key (a string, or a tuple of strings if nested) or a list of keys, as in TorchRL.
 Keys: TypeAlias = NestedKey | list[NestedKey]
@@ -91,6 +91,8 @@ class MapTransform(Transform):
             raise ValueError(
                 f"{type(self).__name__} writes {writes} keys, out_keys has {self.out_keys}"
             )
+        if len({*self.out_keys}) < writes:
+            raise ValueError(f"{type(self).__name__}: out_keys names a key twice: {self.out_keys}")
         self.reads = tuple(reads)
         self.compiled = False
         self.label = " and ".join(repr(key) for key in self.out_keys)
@@ -134,7 +136,9 @@ class MapTransform(Transform):
 
     def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
         """Returns the inputs of `compute`; a subclass may check their values."""
-        return self._inputs(tensordict)
+        maps = self._inputs(tensordict)
+        kinds = (reads.kind for reads in self.reads)
+        return [x.to(signed(x.dtype)) if k == "integer" else x for x, k in zip(maps, kinds)]
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         lacks = (next_tensordict.get(key, None) is None for key in self.in_keys)
@@ -210,7 +214,10 @@ class RecurrentTransform(MapTransform):
 
     @property
     def carried_keys(self) -> list[NestedKey]:
-        """The keys of the previous step that `advance` needs: by default the inputs."""
+        """The keys of the previous step that `advance` needs: by default the inputs.
+
+        Each has the dtype of the input at its place.
+        """
         return self.in_keys
 
     def compute(self, *now: Tensor) -> tuple[Tensor, ...]:
@@ -222,8 +229,15 @@ class RecurrentTransform(MapTransform):
         """Returns the outputs from the previous step's `carried_keys` and the current inputs."""
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        now = self._read(next_tensordict)
-        outputs = self.advance(self._carried(tensordict), now)
+        now, before = self._read(next_tensordict), self._carried(tensordict)
+        for key, then, value in zip(self.carried_keys, before, now):
+            if then.dtype != value.dtype:
+                raise ValueError(
+                    f"representation {self.label}: {key!r} of the previous step is {then.dtype}, "
+                    f"and what is read now {value.dtype}: what converts it afterwards has to write "
+                    "to another key"
+                )
+        outputs = self.advance(before, now)
         env = self.parent
         if env is not None and env.__dict__.get("_torchrl_native_autoreset", False):
             # Such an env returns the first frame of the next episode with the last step of this
@@ -240,7 +254,7 @@ class RecurrentTransform(MapTransform):
             if value is None:
                 raise MissingKey(
                     f"representation {self.label} needs {key!r} of the previous step: pass step "
-                    f"the TensorDict of reset or step_mdp, which holds {key!r}"
+                    f"the TensorDict of reset or step_mdp, and let no later transform drop {key!r}"
                 )
         return before
 
@@ -311,10 +325,28 @@ class RecurrentTransform(MapTransform):
         input_spec = super().transform_input_spec(input_spec)
         if self.parent is None:
             return input_spec
+        self._check_that_none_overwrites()
         observation_spec = self.transform_observation_spec(self.parent.observation_spec)
         for key in self.carried_keys:
             input_spec["full_state_spec"][key] = observation_spec[key].clone()
         return input_spec
+
+    def _check_that_none_overwrites(self) -> None:
+        """Raises ValueError if a later transform of the env writes to a carried key."""
+        later = False
+        transforms: list[Any] = [getattr(self.container, "transform", self)]
+        while transforms:
+            transform = transforms.pop(0)
+            if isinstance(transform, Compose):
+                transforms = [*transform.transforms, *transforms]
+                continue
+            if later and (keys := [key for key in self.carried_keys if key in transform.out_keys]):
+                raise ValueError(
+                    f"{type(transform).__name__} writes to {keys[0]!r}, which "
+                    f"{type(self).__name__} before it reads again at the next step: give it other "
+                    "out_keys"
+                )
+            later = later or transform is self
 
 
 def as_keys(keys: Keys) -> list[NestedKey]:
@@ -353,6 +385,11 @@ def flags_of_batch(flags: Tensor, tensordict: TensorDictBase) -> Tensor:
 def _compiled(compute: Callable[..., tuple[Tensor, ...]]) -> Callable[..., tuple[Tensor, ...]]:
     """Returns a class's compiled `compute`, cached here so that instances can be pickled."""
     return torch.compile(compute, fullgraph=True)
+
+
+def signed(dtype: torch.dtype) -> torch.dtype:
+    """Returns int64 for the unsigned types for which PyTorch lacks most functions."""
+    return torch.int64 if dtype in (torch.uint16, torch.uint32, torch.uint64) else dtype
 
 
 def _is_kind(dtype: torch.dtype, kind: str) -> bool:

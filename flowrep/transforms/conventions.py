@@ -10,14 +10,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeAlias
 
-import torch
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 from torchrl.envs.transforms import CatTensors, Transform
 
 from flowrep.transforms.adapt import AdaptDepth, AdaptFlow, AdaptPose
-from flowrep.transforms.base import Keys, MapTransform, Reads
+from flowrep.transforms.base import Keys, MapTransform, Reads, signed
 from flowrep.transforms.flow import Intrinsics
 from flowrep.transforms.maps import InstanceIds
 from flowrep.transforms.motion import CameraMotion, InstanceMotion
@@ -318,7 +317,8 @@ def sensors_from(
 
     They write `("sensor", "depth")`, `"world_from_cam"` and `"prev_from_curr"`; with `body_ids`,
     `"world_from_body"`, `"instance"` and `"instance_motion"` too; with `flow`, `"raw"`. Buffers are
-    read under the names that `CONVENTIONS[simulator]` lists, beneath `prefix`.
+    read under the names that `CONVENTIONS[simulator]` lists, beneath `prefix`. A second camera
+    needs the adapters themselves, with other `out_keys`.
 
     Args:
         simulator: a key of `CONVENTIONS`.
@@ -423,14 +423,10 @@ class Plane(MapTransform):
         """Returns the map."""
         if len(self.reads[0].shape) == 3:
             picture = picture[..., 0]
-        return (picture.to(_signed(picture.dtype)).unsqueeze(-3),)
+        return (picture.to(signed(picture.dtype)).unsqueeze(-3),)
 
     def output_specs(self, picture: TensorSpec) -> tuple[TensorSpec]:
         """Returns an unbounded spec."""
         *batch, height, width = picture.shape[: picture.ndim - (len(self.reads[0].shape) == 3)]
         shape = (*batch, 1, height, width)
-        return (Unbounded(shape, device=picture.device, dtype=_signed(picture.dtype)),)
-
-
-def _signed(dtype: torch.dtype) -> torch.dtype:
-    return torch.int64 if dtype in (torch.uint16, torch.uint32, torch.uint64) else dtype
+        return (Unbounded(shape, device=picture.device, dtype=signed(picture.dtype)),)

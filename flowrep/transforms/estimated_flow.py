@@ -271,6 +271,7 @@ class EstimatedFlow(FlowTransform):
     """
 
     known = masked = ("raw", "unscaled")
+    needs_camera = False
 
     def __init__(
         self,
@@ -309,9 +310,9 @@ class EstimatedFlow(FlowTransform):
             ego, seen = geometry.ego_flow(depth, K, motion, prev_K=prev_K)
             ego = ego.float().reshape(-1, 2, *ego.shape[-2:])
             flow = self._compensated(current, previous, ego, seen.reshape(-1, 1, *ego.shape[-2:]))
+            flow = torch.where(differs, flow, ego)  # also a plain wall, which the camera passes
         else:
-            flow = self._averaged(self._estimate(current, previous))
-        flow = torch.where(differs, flow, 0.0)
+            flow = torch.where(differs, self._averaged(self._estimate(current, previous)), 0.0)
         known = flow.isfinite().all(-3, keepdim=True)
         flow, known = (
             x.reshape(*batch, *x.shape[-3:]) for x in (torch.where(known, flow, 0.0), known)

@@ -25,6 +25,7 @@ from flowrep.transforms.base import (
     Reads,
     as_keys,
     check_choice,
+    check_distinct_keys,
     flags_of_batch,
 )
 
@@ -57,6 +58,7 @@ class CameraTransform(MapTransform):
 
     K: Tensor | None
     reads_previous_frame = True  # whether K of the previous frame matters
+    needs_camera = True
 
     def __init__(
         self,
@@ -69,6 +71,8 @@ class CameraTransform(MapTransform):
     ) -> None:
         # A key is a string or a tuple of strings; K is a tensor or rows of numbers.
         K, keys = None, []
+        if intrinsics is None and self.needs_camera:
+            raise TypeError("intrinsics is K, [3, 3], or its key in the TensorDict; got None")
         if intrinsics is not None:
             if isinstance(intrinsics, str) or all(isinstance(part, str) for part in intrinsics):
                 keys = as_keys([intrinsics])
@@ -134,16 +138,22 @@ class CameraTransform(MapTransform):
                 "frame's K, prev_intrinsics=, which the transform PreviousIntrinsics writes"
             )
 
+    def _count_call(self) -> None:
+        if not torch.compiler.is_compiling():  # each number would be compiled anew
+            self._calls += 1
+
     @property
     def _needs_one_camera(self) -> bool:
         return self.reads_previous_frame and len(self.camera_keys) == 1
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        self._calls += 1
+        self._count_call()
         if self._needs_one_camera:
-            before, now = (
-                td.get(self.camera_keys[0], None) for td in (tensordict, next_tensordict)
-            )
+            key = self.camera_keys[0]
+            before, now = (td.get(key, None) for td in (tensordict, next_tensordict))
+            if before is None and now is not None:  # a later transform dropped it
+                _, last = self._checked.get(key, (None, None))
+                before = last if last is not None and last.shape == now.shape else None
             # Where an episode is done, an env with autoreset returns the next one's first frame.
             self._check_one_camera(before, now, lambda: _ended(next_tensordict, "done"))
         return super()._step(tensordict, next_tensordict)
@@ -151,7 +161,7 @@ class CameraTransform(MapTransform):
     @dispatch(source="in_keys", dest="out_keys", auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the outputs for a batch of any shape, at its root and under `"next"`."""
-        self._calls += 1
+        self._count_call()
         if self._needs_one_camera:
             # Two frames in a row: the root and "next", or neighbours along the time dimension.
             key, frames = self.camera_keys[0], tensordict
@@ -166,16 +176,9 @@ class CameraTransform(MapTransform):
 
     def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
         maps = super()._read(tensordict)
-        key = mask_key(self.in_keys[0])
-        if self.reads[0] != base.FLOW or (known := tensordict.get(key, None)) is None:
+        if self.reads[0] != base.FLOW:
             return maps
-        like = maps[0][..., :1, :, :]
-        if known.dtype != torch.bool or known.shape != like.shape:
-            raise ValueError(
-                f"representation {self.label}: key {key!r}, the mask of {self.in_keys[0]!r}, "
-                f"should be bool {list(like.shape)}; got {known.dtype} {list(known.shape)}"
-            )
-        return [torch.where(known, maps[0], math.nan), *maps[1:]]
+        return [masked_flow(maps[0], self.in_keys[0], tensordict), *maps[1:]]
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> CameraTransform:
         """Moves K between devices but keeps its type: bfloat16 would round 319.5 px to 320."""
@@ -352,6 +355,7 @@ class FlowFactorize(FlowTransform):
     | `("sensor", "depth")`, m | `"obj"` | float `[*B, 2, H, W]` | any | px/step × `scale` |
     | `("sensor", "prev_from_curr")` | `"raw"` if chosen | as above | any | as above |
     | `"raw_valid"`, if there | `"valid"` if chosen | bool `[*B, 1, H, W]` | | |
+    | | `"raw_valid"` with raw | as `"valid"` | | |
 
     Convention: ego is the flow that the camera's motion alone would cause (Eqs. 7–11 of the paper),
     obj = raw − ego is the flow of what moves by itself (Eq. 6), with `RawFlow`'s sign, grid and
@@ -391,6 +395,7 @@ class FlowFactorize(FlowTransform):
     """
 
     known = ("ego", "obj", "raw", "valid")
+    masked = ("raw",)
 
     def __init__(
         self,
@@ -410,6 +415,8 @@ class FlowFactorize(FlowTransform):
         keys = keys if in_keys is None else in_keys
         options = (outputs, scale, compiled, prev_intrinsics)
         super().__init__(intrinsics, reads, keys, out_keys, *options)
+        if self.scales.get("raw", 1.0) != 1.0:
+            check_distinct_keys(self)
 
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
         """Returns the chosen outputs, from (raw,) depth and camera motion (and K)."""
@@ -439,6 +446,20 @@ def _map_size(maps: Sequence[Tensor | TensorSpec], reads: Sequence[Reads]) -> tu
     at, like = next((each.shape.index("H"), i) for i, each in enumerate(reads) if "H" in each.shape)
     height, width, *_ = maps[like].shape[at - len(reads[like].shape) :]
     return height, width
+
+
+def masked_flow(flow: Tensor, key: NestedKey, tensordict: TensorDictBase) -> Tensor:
+    """Returns the flow `[*B, 2, H, W]` under a key, nan where the mask beside it is False."""
+    known = tensordict.get(mask_key(key), None)
+    if known is None:
+        return flow
+    shape = flow[..., :1, :, :].shape
+    if known.dtype != torch.bool or known.shape != shape:
+        raise ValueError(
+            f"key {mask_key(key)!r}, the mask of {key!r}, should be bool {list(shape)}; got "
+            f"{known.dtype} {list(known.shape)}"
+        )
+    return torch.where(known, flow, math.nan)
 
 
 def mask_key(flow: NestedKey) -> NestedKey:

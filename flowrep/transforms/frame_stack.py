@@ -24,7 +24,8 @@ class FrameStack(RecurrentTransform):
     TensorDict passed to `step`, where the env declares it as part of its state, as TorchRL's
     `StepCounter` does. No state is kept between calls, so stacks can't mix episodes or envs.
     (TorchRL's `CatFrames` keeps state. In a replay buffer it stacks neighbours of a sample, which
-    is wrong for shuffled samples.)
+    is wrong for shuffled samples.) What converts a stack afterwards, such as TorchRL's
+    `ObservationNorm`, has to write to another key, since the next step reads the stack again.
 
     In a replay buffer, the stack stored at the root and the next frame give the next stack exactly,
     in shuffled samples too. Without `("next", out_key)`, a transition takes k + 1 frames instead of
@@ -41,7 +42,8 @@ class FrameStack(RecurrentTransform):
         out_keys: one key for each stack, other than the maps' keys.
 
     Raises:
-        ValueError: `k` is less than 1, or a stack has the key of a map.
+        ValueError: `k` is less than 1, or a stack has the key of a map; in an env, a later
+            transform changes a stack.
         MissingKey: in calls, the previous step or the trajectory is missing.
 
     Example:

@@ -13,7 +13,15 @@ from torchrl.data import Bounded, Categorical, TensorSpec
 
 from flowrep import geometry
 from flowrep.geometry.checks import check_name, checked_count, checked_number
-from flowrep.transforms.base import DEPTH, IDS, RGB, Keys, MapTransform, check_distinct_keys
+from flowrep.transforms.base import (
+    DEPTH,
+    IDS,
+    RGB,
+    Keys,
+    MapTransform,
+    check_distinct_keys,
+    signed,
+)
 
 Encoding = Literal["ids", "onehot"]
 
@@ -42,6 +50,11 @@ class Rgb(MapTransform):
 
     def __init__(self, *, in_keys: Keys = ("sensor", "rgb"), out_keys: Keys = "rgb") -> None:
         super().__init__([RGB], in_keys, out_keys)
+
+    def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
+        (rgb,) = super()._read(tensordict)
+        _check_bytes(rgb, f"{self.in_keys[0]!r} holds values", "divide pictures of 16 bits by 257")
+        return [rgb]
 
     def compute(self, rgb: Tensor) -> tuple[Tensor]:
         """Returns the picture in uint8."""
@@ -99,15 +112,12 @@ class Segmentation(MapTransform):
 
     def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
         (ids,) = super()._read(tensordict)
-        # They would wrap in uint8: 300 would become 44.
-        if self.encoding == "ids" and ids.dtype is not torch.uint8 and ids.numel():
-            least, most = (int(bound) for bound in ids.aminmax())
-            if least < 0 or most > 255:
-                raise ValueError(
-                    f"{self.in_keys[0]!r} holds class ids from {least} to {most}, but uint8 can "
-                    "hold only 0 to 255; give pixels without a class an id in that range, e.g. "
-                    "ids.where((ids >= 0) & (ids < num_classes), 255), or use encoding='onehot'"
-                )
+        if self.encoding == "ids":
+            remedy = (
+                "give pixels without a class an id in that range, e.g. "
+                "ids.where((ids >= 0) & (ids < num_classes), 255), or use encoding='onehot'"
+            )
+            _check_bytes(ids, f"{self.in_keys[0]!r} holds class ids", remedy)
         return [ids]
 
     def compute(self, ids: Tensor) -> tuple[Tensor]:
@@ -245,6 +255,7 @@ class InstanceIds(MapTransform):
         self._calls_to_skip -= 1
         if self._calls_to_skip < 0:
             self._calls_to_skip = _CALLS_PER_LOOK - 1 if ids.is_cuda else 0
+            ids = ids.to(signed(ids.dtype))
             self._name_ids_without_row(ids, next_tensordict[self.out_keys[0]])
         return next_tensordict
 
@@ -280,6 +291,17 @@ class InstanceIds(MapTransform):
         rows = 1 + len(self.body_ids)
         dtype = torch.uint8 if rows <= 256 else torch.int32
         return (Categorical(rows, shape=ids.shape, device=ids.device, dtype=dtype),)
+
+
+def _check_bytes(values: Tensor, what: str, remedy: str) -> None:
+    """Raises ValueError for whole numbers that would wrap in uint8, as 300 would become 44."""
+    if values.dtype is torch.uint8 or not values.numel():
+        return
+    least, most = (int(bound) for bound in values.aminmax())
+    if least < 0 or most > 255:
+        raise ValueError(
+            f"{what} from {least} to {most}, but uint8 can hold only 0 to 255; {remedy}"
+        )
 
 
 def _packed(body: int, link: int) -> int:

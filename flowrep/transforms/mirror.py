@@ -114,9 +114,17 @@ class Mirror(Transform):
         """Replaces the `chosen` `[*B]` transitions by their images."""
         action, swapped = tensordict["action"], self.swapped_actions.to(chosen.device)
         is_one_hot = action.ndim > chosen.ndim and action.shape[-1] == len(swapped)
+        if action.is_floating_point() and not is_one_hot:
+            raise TypeError(f"Mirror exchanges discrete actions, got {action.dtype}")
         image = action[..., swapped] if is_one_hot else swapped[action.long()].to(action.dtype)
         tensordict["action"] = torch.where(expand_as_right(chosen, action), image, action)
         following = tensordict.get("next", None)
+        for step in (tensordict, following):
+            mask = None if step is None else step.get("action_mask", None)
+            if mask is not None:
+                step["action_mask"] = torch.where(
+                    expand_as_right(chosen, mask), mask[..., swapped], mask
+                )
         for key in self.in_keys:
             is_flow = key in self.flow_keys
             if tensordict.get(key, None) is None:

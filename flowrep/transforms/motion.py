@@ -245,11 +245,11 @@ class EstimateCameraMotion(CameraTransform):
 
     def output_specs(self, raw: TensorSpec, *others: TensorSpec) -> tuple[TensorSpec, ...]:
         """Returns unbounded specs, one bounded to [0, 1] for the share, a boolean one for valid."""
-        batch, device = raw.shape[:-3], raw.device
+        batch, device, float32 = raw.shape[:-3], raw.device, torch.float32
         specs = {
-            "motion": Unbounded((*batch, 4, 4), device=device),
-            "inlier_share": Bounded(0.0, 1.0, shape=(*batch, 1), device=device),
-            "covariance": Unbounded((*batch, 6, 6), device=device),
+            "motion": Unbounded((*batch, 4, 4), device=device, dtype=float32),
+            "inlier_share": Bounded(0.0, 1.0, shape=(*batch, 1), device=device, dtype=float32),
+            "covariance": Unbounded((*batch, 6, 6), device=device, dtype=float32),
             "valid": Categorical(2, shape=(*batch, 1), device=device, dtype=torch.bool),
         }
         return tuple(specs[name] for name in self.outputs)

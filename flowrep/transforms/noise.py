@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
@@ -17,6 +18,7 @@ from flowrep.geometry.checks import checked_count, checked_number
 from flowrep.geometry.pose import rotation_from_vector
 from flowrep.transforms import base
 from flowrep.transforms.base import Keys, MapTransform, Reads, as_keys, check_choice
+from flowrep.transforms.flow import masked_flow
 
 FRAME = Reads(("F",), "integer")
 
@@ -67,7 +69,8 @@ class SensorNoise(MapTransform):
     Without it, each call draws new noise. On a replay buffer that is augmentation: the root and
     `"next"` get independent errors. The generator is on the maps' device and its state is part of
     `state_dict`, so that a resumed run continues the sequence. The envs of a `SerialEnv` or
-    `ParallelEnv` draw independent noise unless all get the same seed.
+    `ParallelEnv` draw independent noise unless all get the same seed, or are copies of an env that
+    has been used.
 
     Args:
         sensors: which of `"depth"`, `"motion"` and `"flow"` to read and write.
@@ -133,6 +136,13 @@ class SensorNoise(MapTransform):
         self.seed = None if seed is None else checked_count("seed", seed, 0)
         self.has_frames = bool(frame)
         self._state: Tensor | None = None  # of the generator, after what has been drawn
+
+    def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
+        maps = super()._read(tensordict)
+        for i, (sensor, key) in enumerate(zip(self.sensors, self.in_keys)):
+            if sensor == "flow" and self.out_keys[i] != key:  # the mask lies beside the read key
+                maps[i] = masked_flow(maps[i], key, tensordict)
+        return maps
 
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
         """Returns the sensors' maps with noise; with `frame_key`, frames are the last map."""

@@ -86,8 +86,8 @@ def opengl_pose(sensor: dict[str, Tensor]) -> Tensor:
 
 
 def rows_backward(sensor: dict[str, Tensor]) -> Tensor:
-    """Returns flow, were the env's raw flow backward with rows first."""
-    return -raw(sensor)[[1, 0]]
+    """Returns flow, were the env's raw flow backward with rows first; nan where it is unknown."""
+    return torch.where(valid(sensor), -raw(sensor)[[1, 0]], math.nan)
 
 
 def rows_of_classes(sensor: dict[str, Tensor], bodies: list[int]) -> Tensor:

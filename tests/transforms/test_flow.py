@@ -9,7 +9,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv, check_env_specs
-from torchrl.envs.transforms import Compose, RenameTransform
+from torchrl.envs.transforms import Compose, ExcludeTransform, RenameTransform
 
 from flowrep import geometry
 from flowrep.transforms import (
@@ -20,6 +20,7 @@ from flowrep.transforms import (
     FrameStack,
     PreviousIntrinsics,
     RawFlow,
+    SensorNoise,
     representation_stack,
 )
 from tests.transforms.fake_env import (
@@ -192,6 +193,55 @@ def test_a_mask_of_another_layout_is_refused():
             FlowFactorize(K)(td.clone().set("raw_valid", wrong))
 
 
+def test_a_second_pass_over_unknown_raw_flow_finds_it_unknown_again():
+    td = scene()
+    td["raw"] = torch.full((2, 2, 4), math.nan)
+    split = FlowFactorize(K, outputs=["raw", "obj", "valid"])
+    again = split(split(td).clone())
+    assert not again["raw"].any()
+    assert not again["obj"].any()
+    assert not again["valid"].any()
+
+
+def test_noise_under_another_key_leaves_unknown_flow_unknown():
+    td = RawFlow(K)(scene())
+    td["raw_valid"] = torch.zeros_like(td["raw_valid"])
+    noise = SensorNoise(sensors=["flow"], flow_sigma_px=0.1, out_keys=["noisy"])
+    keys = ["noisy", ("sensor", "depth"), ("sensor", "prev_from_curr")]
+    td = FlowFactorize(K, in_keys=keys, outputs=["obj", "valid"])(noise(td))
+    assert not td["obj"].any()
+    assert not td["valid"].any()
+
+
+def test_raw_flow_that_would_be_scaled_twice_is_refused():
+    with pytest.raises(ValueError, match="reads and writes raw"):
+        FlowFactorize(K, outputs=["raw", "obj"], scale=2.0)
+    split = FlowFactorize(K, outputs=["raw", "obj"], scale=2.0, out_keys=["twice", "obj"])
+    td = split(RawFlow(K)(scene()))
+    assert torch.equal(split(td.clone())["twice"], 2 * td["raw"])
+
+
+@pytest.mark.parametrize("make", [RawFlow, FlowFactorize, EstimateCameraMotion])
+def test_a_camera_that_is_none_is_refused(make):
+    with pytest.raises(TypeError, match="intrinsics is K"):
+        make(None)
+
+
+def test_compiled_calls_are_compiled_once():
+    split, graphs, counts = FlowFactorize(K), [], []
+
+    def counting(graph, example):
+        graphs.append(graph)
+        return graph.forward
+
+    torch.compiler.reset()
+    compiled = torch.compile(split, backend=counting)
+    for _ in range(3):
+        compiled(RawFlow(K)(scene()))
+        counts.append(len(graphs))
+    assert 0 < counts[0] == counts[2]
+
+
 def test_ego_alone_reads_no_raw_flow():
     transform = FlowFactorize(K, outputs=["ego"])
     assert transform.in_keys == [("sensor", "depth"), ("sensor", "prev_from_curr")]
@@ -301,6 +351,13 @@ def test_a_k_that_changes_is_refused_by_whatever_would_ignore_it(make):
         9, break_when_any_done=False
     )
     TransformedEnv(ZoomingEnv((2,)), stack(**CAMERA)).rollout(6, break_when_any_done=False)
+
+
+def test_a_k_that_changes_is_seen_though_a_later_transform_drops_it():
+    dropped = Compose(RawFlow(("sensor", "K")), ExcludeTransform(("sensor", "K")))
+    with pytest.raises(ValueError, match=r"changes .*prev_intrinsics"):
+        TransformedEnv(ZoomingEnv((2,)), dropped).rollout(3)
+    TransformedEnv(ZoomingEnv((2,), zoom=0.0), dropped.clone()).rollout(9)
 
 
 def test_a_k_that_changes_is_seen_in_whatever_batch_shows_it():

@@ -21,7 +21,12 @@ from torchrl.data import (
     Unbounded,
 )
 from torchrl.envs import ParallelEnv, TransformedEnv
-from torchrl.envs.transforms import Compose, MultiStepTransform
+from torchrl.envs.transforms import (
+    Compose,
+    DTypeCastTransform,
+    MultiStepTransform,
+    ObservationNorm,
+)
 from torchrl.envs.utils import step_mdp
 
 from flowrep.transforms import Depth, FrameStack, Segmentation
@@ -130,6 +135,37 @@ def test_what_lacks_the_step_before_is_refused():
     td = env.reset().exclude(STACK).set("action", torch.tensor(0))
     with pytest.raises(KeyError, match="needs 'depth3' of the previous step"):
         env.step(td)
+
+
+def normalised(key):
+    return ObservationNorm(loc=0.0, scale=0.1, in_keys=[key])
+
+
+@pytest.mark.parametrize(
+    ("later", "said"),
+    [
+        (lambda: normalised(STACK), f"ObservationNorm writes to '{STACK}'"),
+        (lambda: Compose(Depth(), normalised(STACK)), f"ObservationNorm writes to '{STACK}'"),
+        (lambda: DTypeCastTransform(torch.float32, torch.float64, [STACK]), "writes to"),
+    ],
+)
+def test_what_would_change_the_stack_for_the_next_step_is_refused(later, said):
+    with pytest.raises(ValueError, match=said):
+        TransformedEnv(FakeSensorEnv((), 1), Compose(stack_of_three(), later())).rollout(2)
+    elsewhere = ObservationNorm(loc=0.0, scale=0.1, in_keys=[STACK], out_keys=["normal"])
+    env = TransformedEnv(FakeSensorEnv((), 1), Compose(normalised(KEY), stack_of_three()))
+    env.append_transform(elsewhere)
+    seen = env.rollout(3)["next"]
+    torch.testing.assert_close(seen["normal"], 0.1 * seen[STACK], equal_nan=True)
+
+
+def test_a_policy_that_converts_the_stack_is_refused():
+    def policy(td):
+        td[STACK] = td[STACK].double()
+        return td.set("action", torch.zeros(td.shape, dtype=torch.long))
+
+    with pytest.raises(ValueError, match=f"'{STACK}' of the previous step is torch.float64"):
+        stacked_single(1).rollout(2, policy)
 
 
 def test_specs_stay_of_their_kind():

@@ -41,6 +41,22 @@ def test_specs_say_how_many_classes_there_are_or_which_values(make, want):
     assert env.observation_spec[transform.out_keys[0]] == want
 
 
+@pytest.mark.parametrize("dtype", [torch.uint16, torch.uint32, torch.int64])
+def test_whole_numbers_of_any_type_are_read(dtype):
+    ids = torch.tensor([[[0, 2, 1]]]).to(dtype)
+    assert read(Segmentation(3), "semantic", ids).tolist() == [[[0, 2, 1]]]
+    onehot = read(Segmentation(3, encoding="onehot"), "semantic", ids)
+    assert onehot.argmax(0).tolist() == [[0, 2, 1]]
+    rows = read(
+        InstanceIds([2, 1], in_keys=("sensor", "instance"), out_keys="rows"), "instance", ids
+    )
+    assert rows.tolist() == [[[0, 1, 2]]]
+    picture = torch.full((3, 2, 2), 255).to(dtype)
+    assert read(Rgb(), "rgb", picture).unique().tolist() == [255]
+    with pytest.raises(ValueError, match=r"'rgb'\) holds values from 3000 to 3000.*257"):
+        read(Rgb(), "rgb", torch.full((3, 2, 2), 3000).to(dtype))
+
+
 @pytest.mark.parametrize(
     ("ids", "said"),
     [

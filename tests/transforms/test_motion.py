@@ -8,7 +8,13 @@ from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
-from flowrep.transforms import CameraMotion, EstimateCameraMotion, FlowFactorize, RawFlow
+from flowrep.transforms import (
+    AdaptPose,
+    CameraMotion,
+    EstimateCameraMotion,
+    FlowFactorize,
+    RawFlow,
+)
 from tests.transforms.fake_env import FakeSensorEnv, frame_motions
 
 MOTION = "motion"
@@ -29,6 +35,24 @@ def test_a_step_from_an_earlier_tensordict_moves_from_its_pose():
     once = [second[MOTION][i, :3, :3].trace().item() for i in (0, 1)]
     assert all(far < near - 1e-4 for far, near in zip(turned, once))
     assert not camera_motion().state_dict()
+
+
+def test_two_cameras_that_share_a_pose_s_key_are_refused():
+    def camera():
+        adapt = AdaptPose(in_keys=("sensor", "world_from_cam"), out_keys="pose")
+        return Compose(adapt, CameraMotion(in_keys="pose"))
+
+    TransformedEnv(FakeSensorEnv(), camera()).rollout(2)
+    with pytest.raises(ValueError, match="AdaptPose writes to 'pose', which CameraMotion"):
+        TransformedEnv(FakeSensorEnv(), Compose(camera(), camera())).rollout(2)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_autocast_rounds_no_motion(dtype):
+    td = Compose(RawFlow(WIDE), EstimateCameraMotion(WIDE))(wide_frames())
+    with torch.autocast("cpu", dtype=dtype):
+        other = Compose(RawFlow(WIDE), EstimateCameraMotion(WIDE))(wide_frames())
+    assert torch.equal(other["sensor", "prev_from_curr"], td["sensor", "prev_from_curr"])
 
 
 def wide_frames(count: int = 3) -> TensorDict:
