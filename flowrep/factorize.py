@@ -18,6 +18,7 @@ require(
     module=__name__,
 )  # fmt: skip
 
+from hydra.core.hydra_config import HydraConfig
 from hydra.utils import get_class
 
 from flowrep.config import UsageError
@@ -80,9 +81,16 @@ def factorize_recording(config: FactorizeConfig) -> int:
 
 def open_stream(config: FactorizeConfig) -> sequences.Stream:
     """Returns the recording or camera that `input` and `format` name."""
+    from flowrep.sequences.declared import DeclaredRecording
+
     reader, options = get_class(config.format.target), config.format.options()
     check_reader_options(reader, options)
-    return reader(str(config.input), **options)
+    stream: sequences.Stream = reader(str(config.input), **options)
+    if isinstance(stream, DeclaredRecording):
+        typed = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
+        keys = [text.lstrip("+").partition("=")[0] for text in typed]
+        stream.check_files([k.removeprefix("format.") for k in keys if k.startswith("format.")])
+    return stream
 
 
 def open_flow_source(config: FactorizeConfig, stream: sequences.Stream) -> FlowSource:

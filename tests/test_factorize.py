@@ -165,11 +165,24 @@ def test_a_signal_keeps_the_frames_that_are_done(
         factorize(tmp_path, "flow=exact")
 
 
-@pytest.mark.parametrize("folder", ["out", ".", "..", "/"])
+def test_a_job_that_was_killed_before_its_first_frame_is_in_nobodys_way(tmp_path):
+    partial = tmp_path / "out.partial"
+    partial.mkdir()
+    (partial / "job.json").write_text("{}")
+    Output(tmp_path / "out", {}).close()
+    partial.mkdir()
+    (partial / "job.json").write_text("{}")
+    (partial / "frames.csv").write_text("frame\n")
+    with pytest.raises(SequenceError, match="exists already"):
+        Output(tmp_path / "out", {})
+
+
+@pytest.mark.parametrize("folder", ["out", ".", "..", "/", "link"])
 def test_what_is_there_is_not_overwritten(folder, tmp_path):
     (tmp_path / "out").mkdir()
+    (tmp_path / "link").symlink_to("nowhere")
     with pytest.raises(SequenceError, match=re.escape(folder)):
-        Output(tmp_path / folder if folder == "out" else folder, {})
+        Output(tmp_path / folder if folder.isalpha() else folder, {})
 
 
 @pytest.mark.parametrize(
@@ -332,6 +345,12 @@ def run(monkeypatch, *arguments) -> int:
     with pytest.raises(SystemExit) as ended:
         main()
     return ended.value.code
+
+
+def test_a_file_that_is_typed_has_to_be_there(moments, tmp_path, monkeypatch, capsys):
+    where = [f"input={tmp_path / 'in'}", f"output={tmp_path / 'out'}", "format=frames"]
+    assert run(monkeypatch, *where, "format.times=times.txt", "flow=exact") == 2
+    assert "error: format.times: there is no file" in capsys.readouterr().err
 
 
 EXPECTED = {

@@ -113,6 +113,8 @@ def as_pose(
     values = torch.from_numpy(np.array(numbers, dtype=np.float64))
     given: PoseLayout = "xyz_xyzw" if layout == "xyzw_xyz" else layout
     if layout == "matrix":
+        if values.shape[-1] not in (12, 16):
+            raise SequenceError(source, f"has {values.shape[-1]} numbers, a matrix has 12 or 16")
         values = values.unflatten(-1, (-1, 4))
         given = "matrix" if values.shape[-2] == 4 else "matrix_3x4"
     elif layout == "xyzw_xyz":

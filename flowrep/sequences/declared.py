@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import KW_ONLY, dataclass
+from glob import escape
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,7 +16,8 @@ from numpy.typing import NDArray
 from omegaconf import OmegaConf
 
 from flowrep import geometry
-from flowrep.config import CONF_DIR
+from flowrep.config import CONF_DIR, closest_first, group_choices
+from flowrep.config.schema import check_reader_options
 from flowrep.sequences import calibration, files
 from flowrep.sequences.calibration import as_pose, camera_matrix
 from flowrep.sequences.recording import Frame, Pose, Recording, SequenceError
@@ -107,7 +109,12 @@ class DeclaredRecording(Recording):
         self._names, self._times_s = [*listed], times_s
         left_out = self._match_depth(depths, depth_times_s)
         if self.times is not None and self._exists(self.times):
-            table, rows, *_ = self._rows(self.times, (0, 1))
+            # Rows in the frames' order hold a time alone; others begin with one.
+            columns = None if self.rows_by == "order" else (0, 1)
+            table, rows, *_ = self._rows(self.times, columns)
+            if table.shape[1] > 1:
+                says = f"has {table.shape[1]} numbers in a row, expected seconds, with a point"
+                raise SequenceError(self._path(self.times), says)
             self._times_s = table[rows, 0] * self.time_unit_s
             left_out["without a time"] = rows < 0
         left_out |= self._read_poses() | self._read_intrinsics()
@@ -117,7 +124,7 @@ class DeclaredRecording(Recording):
         left_out["in format.leave_out"] = np.isin(self._names, list(self.leave_out))
         self._choose(left_out)
         self._made: dict[Any, tuple[Any, Any]] = {}
-        unit_m = self.depth_unit_m or files.usual_unit_m(files.read_array(self._depths[0]))
+        unit_m = self.depth_unit_m or files.usual_unit_m(self._depths[0], self.depth_coding)
         named = "pose_direction", "pose_axes", "depth_kind", "flow_direction", "flow_channels"
         self.conventions = {name: getattr(self, name) for name in named}
         self.conventions |= {"depth_unit_m": str(unit_m)}
@@ -138,7 +145,19 @@ class DeclaredRecording(Recording):
 
     def _exists(self, pattern: str) -> bool:
         path = self._path(pattern.partition(":")[0], next="*")
-        return path.parent.is_dir() and any(path.parent.glob(path.name))
+        name = escape(path.name).replace("[*]", "*")
+        return path.parent.is_dir() and any(path.parent.glob(name))
+
+    def check_files(self, options: Collection[str]) -> None:
+        """Raises SequenceError if the files of one of these options, which may lack, are not there.
+
+        What a user names has to exist; what only a format names may be absent.
+        """
+        for option in ("poses", "times", "flow", "flow_mask"):
+            pattern = getattr(self, option)
+            if option in options and pattern is not None and not self._exists(pattern):
+                path = self._path(pattern, next="*")
+                raise SequenceError(f"format.{option}", f"there is no file {path}")
 
     def _flow_fits(self) -> tuple[bool, str]:
         """Returns whether the recorded flow can be used, and if not, why."""
@@ -227,7 +246,11 @@ class DeclaredRecording(Recording):
             if self.interpolate:
                 before, after, share = between(times_s, self._times_s, self.tolerance_s)
         elif is_keyed:
-            row_of = {int(key): row for row, key in enumerate(table[:, self.key_column])}
+            keys = table[:, self.key_column]
+            row_of = {key: row for row, key in enumerate(keys.tolist())}
+            if len(row_of) < len(keys) or not np.isfinite(keys).all():
+                says = "two rows for one frame (choose with format.rows_where), or none's number"
+                raise SequenceError(path, f"has {says}")
             before = after = np.array([row_of.get(_number(name), -1) for name in self._names])
         elif len(table) != len(before):
             raise SequenceError(path, f"has {len(table)} rows for {len(before)} frames")
@@ -274,7 +297,7 @@ class DeclaredRecording(Recording):
         source = self._path(self.intrinsics) if isinstance(self.intrinsics, str) else "intrinsics"
         if isinstance(self.intrinsics, str) and self.intrinsics.endswith(".json"):
             camera = calibration.read_camera(self._path(self.intrinsics))
-            self._size = camera.height, camera.width
+            self._size = camera.height, camera.width  # of the camera of K
             self.intrinsics, self.first_pixel_centre = camera.numbers, 0.5
             if not self.distortion:
                 self.distortion, self.lens = camera.distortion, camera.lens
@@ -317,10 +340,11 @@ class DeclaredRecording(Recording):
         values = self._times_s
         if values is None:
             values = np.array([float(_number(name)) for name in self._names])
-        # The number that each frame would have if none were missing.
-        steps = np.diff(values)
-        usual = np.median(steps) if len(steps) and (steps > 0).all() else np.inf
-        self._positions = np.append(0, np.rint(steps / usual).clip(1).cumsum()).astype(int)
+        self._positions = positions(values)
+        # Numbers tell which frame is missing, even if the times between frames vary.
+        numbers = np.array([float(_number(name)) for name in self._names])
+        are_numbers = (np.diff(numbers) > 0).all() and not any("." in name for name in self._names)
+        self._numbers = positions(numbers) if are_numbers else self._positions
 
     # The frames.
 
@@ -332,12 +356,17 @@ class DeclaredRecording(Recording):
             source = self._rgbs[i]
             rgb = files.read_rgb(source)
         elif self._video is not None:
-            rgb, source = self._video[i], self._video.path
+            number = _number(name) if self.rows_by == "number" else i
+            rgb, source = self._video[number], self._video.path
         depth = self._stored_depth(i)
         size: tuple[int, ...] = depth.shape if rgb is None else rgb.shape[:2]
-        K = K_depth = camera_matrix(self._K_numbers[i], size, self.first_pixel_centre)
+        of_K = self._size or size
+        if of_K != size and not (self.resize_rgb and of_K == depth.shape):
+            says = f"has {list(size)} rows and columns, intrinsics.json says {list(of_K)}"
+            raise SequenceError(source, says)
+        K = K_depth = camera_matrix(self._K_numbers[i], of_K, self.first_pixel_centre)
         if self.resize_rgb and rgb is not None:
-            (height, width), size = size, depth.shape
+            (height, width), size = of_K, depth.shape
             K = K_depth = np.diag([size[1] / width, size[0] / height, 1.0]) @ K
             rgb = cv2.resize(rgb, size[::-1], interpolation=cv2.INTER_AREA)
         if self._depth_numbers is not None:
@@ -362,7 +391,7 @@ class DeclaredRecording(Recording):
         if self.flow is not None and self.has_flow and index > 0:
             other = i + 1 if self.backwards else i - 1
             raw = self._raw(self.flow, name, self._names[other])
-            is_next = abs(self._positions[i] - self._positions[other]) == 1
+            is_next = abs(self._numbers[i] - self._numbers[other]) == 1
             since = self._names[other] if is_next else None
         time_s = None if self._times_s is None else float(self._times_s[i])
         position: Any = {"clip": int(self._clips[i]), "position": int(self._positions[i])}
@@ -378,10 +407,6 @@ class DeclaredRecording(Recording):
     def _stored_depth(self, i: int) -> NDArray[np.float32]:
         path, codes = self._depths[i], (self.depth_missing, self.depth_no_surface)
         depth = files.read_depth(path, self.depth_unit_m, *codes, self.depth_coding)
-        size = self._size or depth.shape
-        if depth.shape != size and not self.resize_rgb:
-            says = f"has {list(depth.shape)} rows and columns, intrinsics.json says {list(size)}"
-            raise SequenceError(path, says)
         if self.depth_inf == "missing":
             depth[np.isinf(depth)] = np.nan
         if self.confidence is not None:
@@ -403,6 +428,13 @@ class DeclaredRecording(Recording):
             if mask.is_file():
                 raw[:, files.read_array(mask) != 0] = np.nan
         return raw
+
+
+def positions(values: Floats) -> Indices:
+    """Returns the number that each frame would have if none were missing, from times or numbers."""
+    steps = np.diff(values)
+    usual = np.median(steps[steps > 0]) if (steps > 0).any() else np.inf
+    return np.append(0, np.rint(steps / usual).clip(1).cumsum()).astype(int)
 
 
 def _number(name: str) -> int:
@@ -462,7 +494,13 @@ def open_recording(folder: str | Path, format: str, **options: Any) -> Recording
     """
     from flowrep import sequences
 
+    if format not in group_choices("format"):
+        there = closest_first(format, group_choices("format"))
+        raise SequenceError(f"format={format}", f"is unknown; there are: {there}")
     keys = declaration(format) | options
     reader = getattr(sequences, keys.pop("_target_").rpartition(".")[2])
+    check_reader_options(reader, keys)
     recording: Recording = reader(folder, **keys)
+    if isinstance(recording, DeclaredRecording):
+        recording.check_files(options)
     return recording

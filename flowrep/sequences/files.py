@@ -42,6 +42,8 @@ def find_files(path: Path, kind: str) -> dict[str, Path]:
     any_suffix = not any(after.lower().endswith(_SUFFIXES[kind]) for kind in _SUFFIXES)
     found: dict[str, Path] = {}
     for file in path.parent.iterdir() if path.parent.is_dir() else ():
+        if file.name.startswith(".") or not file.is_file():
+            continue
         if any_suffix and file.suffix.lower() not in _SUFFIXES[kind]:
             continue
         stem = file.stem if any_suffix else file.name
@@ -50,12 +52,20 @@ def find_files(path: Path, kind: str) -> dict[str, Path]:
             if other := found.get(name):
                 raise SequenceError(file, f"belongs to the same frame as {other.name}; remove one")
             found[name] = file
-    return {name: found[name] for name in sorted(found, key=_natural)}
+    decimals = {name: _decimal(name) for name in found}
+    order: Any = decimals.get if all(decimals.values()) else _natural
+    return {name: found[name] for name in sorted(found, key=order)}
+
+
+def _decimal(name: str) -> tuple[int, str] | None:
+    # 0.05 comes before 0.1; as floats, 19 digits would lose some.
+    match = re.fullmatch(r"([0-9]+)\.?([0-9]*)", name)
+    return match and (int(match[1]), match[2])
 
 
 def _natural(name: str) -> list[int | str]:
     # frame_9 comes before frame_10; texts and numbers alternate, so that all are comparable.
-    return [int(piece) if piece.isdecimal() else piece for piece in re.split(r"([0-9]+)", name)]
+    return [int(x) if i % 2 else x for i, x in enumerate(re.split(r"([0-9]+)", name))]
 
 
 def with_suffix(path: Path, kind: str) -> Path:
@@ -187,17 +197,13 @@ def read_depth(
         coding: of colour pictures: `"float32_rgba"`, a float whose bytes are blue, green, red and
             alpha (TartanAir V2); `"rgb24"`, red + 256 green + 65536 blue (CARLA).
     """
-    stored = read_array(path)
-    if coding == "float32_rgba" and stored.dtype == np.uint8 and stored.shape[2:] == (4,):
-        stored = np.ascontiguousarray(stored[..., [2, 1, 0, 3]]).view("<f4")[..., 0]
-    elif coding == "rgb24" and stored.dtype == np.uint8 and stored.shape[2:] in ((3,), (4,)):
-        stored = stored[..., :3].astype(np.uint32) @ np.array([1, 256, 65536], np.uint32)
+    stored = _without_coding(path, coding)
     is_whole = stored.dtype.kind in "ui" and stored.itemsize > 1
     if stored.ndim != 2 or not (is_whole or stored.dtype.kind == "f"):
         given = f"holds {stored.dtype} {list(stored.shape)}"
         wanted = "one channel of 16 bits or floats" if coding is None else f"depth_coding={coding}"
         raise SequenceError(path, f"{given}, expected {wanted}")
-    unit_m = usual_unit_m(stored) if unit_m is None else unit_m
+    unit_m = (0.001 if is_whole else 1.0) if unit_m is None else unit_m
     depth = (stored * np.float64(unit_m)).astype(np.float32)
     if is_whole:
         depth[np.isin(stored, list(missing))] = np.nan
@@ -206,9 +212,19 @@ def read_depth(
     return depth
 
 
-def usual_unit_m(stored: NDArray[Any]) -> float:
-    """Returns the metres of a stored 1: 0.001 for whole numbers, 1 for floats."""
-    return 0.001 if stored.dtype.kind in "ui" and stored.ndim == 2 else 1.0
+def usual_unit_m(path: Path, coding: DepthCoding | None = None) -> float:
+    """Returns the metres of a 1 that a file stores: 0.001 for whole numbers, 1 for floats."""
+    return 0.001 if _without_coding(path, coding).dtype.kind in "ui" else 1.0
+
+
+def _without_coding(path: Path, coding: DepthCoding | None) -> NDArray[Any]:
+    """Returns stored depth as one number a pixel."""
+    stored = read_array(path)
+    if coding == "float32_rgba" and stored.dtype == np.uint8 and stored.shape[2:] == (4,):
+        stored = np.ascontiguousarray(stored[..., [2, 1, 0, 3]]).view("<f4")[..., 0]
+    elif coding == "rgb24" and stored.dtype == np.uint8 and stored.shape[2:] in ((3,), (4,)):
+        stored = stored[..., :3].astype(np.uint32) @ np.array([1, 256, 65536], np.uint32)
+    return stored
 
 
 def read_flow(path: Path, coding: FlowCoding = "kitti") -> Flow:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -56,8 +57,10 @@ class Output:
     ) -> None:
         self.path = Path(path)
         self.partial = Path(f"{self.path}.partial")
+        if self.partial.is_dir() and {file.name for file in self.partial.iterdir()} == {"job.json"}:
+            shutil.rmtree(self.partial)  # of a job that was killed before its first frame
         for folder in (self.path, self.partial):
-            if folder.exists():
+            if os.path.lexists(folder):
                 raise SequenceError(folder, "exists already; remove it, or give another output")
         if rerun:  # fail before the folder is created
             require("rerun=true", "rerun", "rerun")

@@ -36,6 +36,7 @@ class Video:
 
     def __init__(self, path: str | Path, *, fps: float) -> None:
         self.path, self.fps = Path(path), fps
+        self._url = f"file:{self.path.absolute()}"  # FFmpeg would take `out:1` for a protocol
         self._size = 0, 0
         self._ffmpeg: Any = None  # the process, once it has started, and the file of its messages
         self._messages: Any = None
@@ -71,7 +72,7 @@ class Video:
         raw = ("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", rate)
         self._messages = tempfile.TemporaryFile()  # noqa: SIM115 - closed with FFmpeg
         self._ffmpeg = subprocess.Popen(
-            [get_ffmpeg_exe(), "-y", "-v", "error", *raw, "-i", "-", *_CODEC, str(self.path)],
+            [get_ffmpeg_exe(), "-y", "-v", "error", *raw, "-i", "-", *_CODEC, self._url],
             stdin=subprocess.PIPE,
             stderr=self._messages,
             start_new_session=True,  # so that Ctrl-C doesn't end it before this process can

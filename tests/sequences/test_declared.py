@@ -11,6 +11,7 @@ pytest.importorskip("cv2", reason="recordings need OpenCV")
 
 import cv2
 
+from flowrep.config import UsageError
 from flowrep.sequences import SequenceError, factorize_frames, open_recording
 from tests.sequences import synthetic
 from tests.sequences.synthetic import HEIGHT, WIDTH, K, numbers, put, quaternion_line
@@ -380,7 +381,130 @@ def test_flow_of_distorted_pictures_is_not_used(moments, tmp_path):
     assert "distorted" in recording.no_flow
 
 
+# Files and options that aren't what they should be.
+
+
+def test_depth_of_another_size_than_the_picture_is_refused(moments, tmp_path):
+    put(tmp_path / "depth/0001.png", np.zeros((23, 40), np.uint16))
+    with pytest.raises(SequenceError, match="depth 40 x 23, colour 40 x 24"):
+        open_frames(tmp_path)[1]
+
+
+def test_frames_are_in_the_order_of_numbers_and_of_times(tmp_path):
+    def opened(*names):
+        folder = tmp_path / names[-1]
+        for name in names:
+            put(folder / f"rgb/{name}.png", np.zeros((4, 6, 3), np.uint8))
+            put(folder / f"depth/{name}.png", np.full((4, 6), 1000, np.uint16))
+        put(folder / "depth/._old.png", np.zeros((4, 6), np.uint16))  # as macOS writes
+        (folder / "depth/old.png").mkdir()
+        return [frame.name for frame in open_frames(folder, intrinsics=[1.0])]
+
+    decimal = ("0.05", "0.1", "0.15", "0.2", "10.0")
+    assert opened(*decimal) == [*decimal]
+    assert opened("f9", "f10", "f٣") == ["f9", "f10", "f٣"]  # an Arabic digit, which is a letter
+    long = ("1403636579763555583", "1403636579763555584")  # equal as floats
+    assert opened(*long) == [*long]
+
+
+@pytest.mark.parametrize(
+    ("rows", "count"), [(["0,033", "0,066", "0,100"], 2), (["0 0.0", "1 0.1", "2 0.2"], 2)]
+)
+def test_times_are_a_number_a_row(rows, count, moments, tmp_path):
+    put(tmp_path / "timestamps.txt", rows)
+    with pytest.raises(SequenceError, match=rf"timestamps.txt: has {count} numbers in a row"):
+        open_frames(tmp_path)
+
+
+@pytest.mark.parametrize("option", ["poses", "times", "flow", "flow_mask"])
+def test_a_file_that_is_named_has_to_be_there(option, moments, tmp_path):
+    for name in ("nothing.txt", None):
+        (tmp_path / "timestamps.txt").unlink(missing_ok=True)  # which only the format names
+        if name is None:
+            open_frames(tmp_path, **{option: name})
+            continue
+        with pytest.raises(SequenceError, match=rf"format\.{option}: there is no file .*{name}"):
+            open_frames(tmp_path, **{option: name})
+
+
+def test_brackets_in_a_name_are_brackets(moments, tmp_path):
+    (tmp_path / "poses.txt").rename(tmp_path / "poses [cam1].txt")
+    assert open_frames(tmp_path, poses="poses [cam1].txt").has_poses
+
+
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        ({"flow_direction": "Forward"}, "flow_direction"),
+        ({"depth_inf": "Missing"}, "depth_inf"),
+        ({"backwards": "false"}, "backwards"),
+        ({"depth_unit_m": "0.001"}, "depth_unit_m"),
+        ({"dept": "d/*"}, "dept: there is no such key"),
+        ({"marker_from_cam": [0.1, 0.2, 0.3]}, "marker_from_cam: has 3 numbers"),
+        ({"colour_from_depth": [1.0, 2.0]}, "colour_from_depth: has 2 numbers"),
+    ],
+)
+def test_options_are_checked(given, named, moments, tmp_path):
+    with pytest.raises((SequenceError, UsageError), match=named):
+        open_frames(tmp_path, **given)
+
+
+def test_an_unknown_format_is_told_which_there_are(tmp_path):
+    with pytest.raises(SequenceError, match=r"format=tun: is unknown; there are: tum, .*zed"):
+        open_recording(tmp_path, "tun")
+
+
+@pytest.mark.parametrize("key", ["1", "nan", "inf"])
+def test_a_table_has_one_row_for_a_frame_s_number(key, moments, tmp_path):
+    poses = [f"{i} {numbers(m.world_from_cam)}" for i, m in enumerate(moments)]
+    put(tmp_path / "poses.txt", poses)
+    keyed = {"rows_by": "number", "times": None}
+    assert len(open_frames(tmp_path, **keyed)) == 3
+    put(tmp_path / "poses.txt", [*poses, f"{key} {numbers(np.eye(4))}"])
+    with pytest.raises(SequenceError, match=r"poses\.txt: has two rows for one frame"):
+        open_frames(tmp_path, **keyed)
+
+
+def test_k_of_a_file_is_of_the_pictures_or_of_depth(moments, tmp_path):
+    for i, moment in enumerate(moments):
+        put(tmp_path / f"rgb/{i:04d}.png", moment.rgb.repeat(2, 0).repeat(2, 1))
+    frame = open_frames(tmp_path, resize_rgb=True)[0]  # the file has depth's size
+    np.testing.assert_allclose(frame.K, K)
+    double = {"width": 2 * WIDTH, "height": 2 * HEIGHT}
+    put(tmp_path / "intrinsics.json", synthetic.camera_json(**double))
+    np.testing.assert_allclose(open_frames(tmp_path, resize_rgb=True)[0].K[:2], K[:2] / 2)
+    registered = open_frames(tmp_path, depth_intrinsics=[31.0, 27.0, 18.5, 13.0])[0]
+    assert registered.depth.shape == (2 * HEIGHT, 2 * WIDTH)
+
+
+def test_the_unit_of_coded_depth_is_that_of_its_numbers(moments, tmp_path):
+    for name in FRAMES:
+        put(tmp_path / f"depth/{name}.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    assert float(open_frames(tmp_path, depth_coding="rgb24").conventions["depth_unit_m"]) == 0.001
+
+
 # Gaps.
+
+
+def test_times_do_not_hide_that_a_frame_is_missing(tmp_path):
+    synthetic.write_frames(tmp_path)
+    for number in range(3, 7):
+        for file in ("rgb/*.png", "depth/*.png", "flow/*.flo"):
+            source = tmp_path / file.replace("*", "0002")
+            (tmp_path / file.replace("*", f"{number:04d}")).write_bytes(source.read_bytes())
+    options = {"poses": None, "intrinsics": [0.5]}
+
+    def since(times):
+        put(tmp_path / "timestamps.txt", map(str, times))
+        return [frame.raw_since for frame in open_frames(tmp_path, **options)]
+
+    whole = [None, *(f"{i:04d}" for i in range(6))]
+    assert since([0, 0.1, 0.2, 0.5, 0.6, 0.7, 0.8]) == whole  # a pause of the camera
+    for file in ("rgb/0003.png", "depth/0003.png", "flow/0003.flo"):
+        (tmp_path / file).unlink()
+    lost = [None, "0000", "0001", None, "0004", "0005"]
+    assert since([0, 0.1, 0.2, 0.4, 0.5, 0.5]) == lost
+    assert since([0, 0.1, 0.2, 0.3, 0.4, 0.5]) == lost
 
 
 @pytest.mark.parametrize("timed", [False, True])

@@ -109,6 +109,16 @@ def test_pictures_of_a_video_in_any_order(tmp_path):
         np.testing.assert_array_equal(recording[index].rgb, forwards[index])
 
 
+def test_a_video_s_picture_is_that_of_the_frame_s_number(tmp_path):
+    write_stray_scanner(tmp_path / "in")
+    whole = [frame.rgb for frame in open_recording(tmp_path / "in", "stray_scanner")]
+    for kind in ("depth", "confidence"):
+        (tmp_path / f"in/{kind}/000001.png").unlink()
+    recording = open_recording(tmp_path / "in", "stray_scanner")
+    assert [frame.name for frame in recording] == ["000000", "000002"]
+    np.testing.assert_array_equal(recording[1].rgb, whole[2])
+
+
 def test_an_older_stray_recording_has_one_camera(tmp_path):
     write_stray_scanner(tmp_path / "in")
     one = {"intrinsics": "camera_matrix.csv", "intrinsics_columns": None}

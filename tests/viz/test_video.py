@@ -41,6 +41,13 @@ def test_a_video_of_odd_size_can_be_played_and_keeps_the_size_of_its_first_frame
     assert viz.is_playable(path)
 
 
+@pytest.mark.parametrize("name", ["out:1", "file:x", "-dash", "50 %03d"])
+def test_a_folder_may_have_any_name(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    viz.write_video(f"{name}/film.mp4", noise(2), fps=4)
+    assert [str(path) for path in tmp_path.rglob("*.mp4")] == [str(tmp_path / name / "film.mp4")]
+
+
 @pytest.mark.parametrize("frames", [3, 300])  # full at the end, or while frames are written
 def test_a_full_disk_ends_in_one_line_and_leaves_the_old_film(tmp_path, frames):
     path = tmp_path / "episode.mp4"
