@@ -317,7 +317,7 @@ def packed(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Returns matrices and filters as int8 with a scale for each row, other weights unchanged.
 
     A weight is rounded to 1/127 of the largest in its row. That is coarser than bfloat16, in which
-    agents compute; README.md of the pretrained agents gives their success with and without it.
+    agents compute; README.md of the pretrained agents gives the success of one with and without it.
     """
     stored = {}
     for name, weight in weights.items():
