@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Iterable
+from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
 from flowrep.extras import require
@@ -131,8 +132,7 @@ def finish(config: TrainConfig, folder: RunFolder, typed: Iterable[str] = ()) ->
     from flowrep.experiment.runner import Runner
 
     how_to_go_on = line_for("train", resume=str(folder.path))
-    with StopRequest() as stop:
-        runner = Runner(config, folder)
+    with StopRequest() as stop, closing(Runner(config, folder)) as runner:
         if config.resume is None:
             folder.begin(runner.config, typed)
         else:
@@ -148,8 +148,6 @@ def finish(config: TrainConfig, folder: RunFolder, typed: Iterable[str] = ()) ->
                 f"after {runner.frames} frames: {error}{free}",
                 f"Continue with: {how_to_go_on}" if may_go_on else "",
             )
-        finally:
-            runner.close()
     if stop and not is_evaluated:
         print(f"\nstopped after {runner.frames} frames; the run is saved. Continue with")
         print(f"  {how_to_go_on}")

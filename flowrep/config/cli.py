@@ -174,15 +174,18 @@ def checked(config: DictConfig, schema: type[Command]) -> Any:
 
 
 def _check_no_file_is_hidden(job: Any) -> None:
-    """Checks that no file of the user's has the path of one of flowrep's, which Hydra would read.
-
-    An unchanged copy of that file is allowed.
-    """
-    sources = (source for source in job.runtime.config_sources if source.schema == "file")
-    for source, own in product(sources, CONF_DIR.glob("**/*.yaml")):
-        file = Path(source.path) / own.relative_to(CONF_DIR)
-        if file.is_file() and file.read_bytes() != own.read_bytes():
-            raise UsageError(f"{file} is not read, as flowrep has a file of that name: rename it")
+    """Checks that no choice is a file of the user's that Hydra finds in flowrep's folder first."""
+    folders = [Path(each.path) for each in job.runtime.config_sources if each.schema == "file"]
+    later = folders[folders.index(CONF_DIR) + 1 :] if CONF_DIR in folders else []
+    for group, choice in job.runtime.choices.items():
+        names = [choice] if isinstance(choice, str) else choice or []
+        for folder, name in product(later, names):
+            path = f"{group.partition('@')[0]}/{name}.yaml"
+            file, ours = folder / path, CONF_DIR / path
+            are_there = file.is_file() and ours.is_file()
+            if are_there and file.read_bytes() != ours.read_bytes():
+                remedy = "flowrep has a file of that name: rename it"
+                raise UsageError(f"{file} is not read, as {remedy}")
 
 
 def plain_config(config: DictConfig) -> dict[str, Any]:

@@ -77,7 +77,7 @@ class Agent(Driver):
             overrides: keys of conf/train.yaml and their values, such as `scene="s_turn"`,
                 `representations=["ego", "obj"]`, `preset="laptop"`, `total_frames=50_000` or
                 `evaluation={"every_frames": 0}`. To choose a section and also set a key in it, add
-                `**{"scene.time_limit_steps": 100}`. For a scene in a file of your own,
+                `**{"scene.time_limit_steps": 100}`. For a scene in a file
                 mine/scene/alley.yaml, add `**{"hydra.searchpath": ["file://mine"]}` to
                 `scene="alley"`.
 
@@ -220,7 +220,7 @@ class Agent(Driver):
         return evaluation.records(**self.origin("evaluate"))
 
     def save(self, path: str | Path, *, small: bool = False) -> None:
-        """Writes the policy and the config of its training into one file, which `load` reads.
+        """Writes the policy and its config, with the scene of its training, for `load` to read.
 
         With `small`, each weight takes one byte, see `packed`.
         """
@@ -229,7 +229,7 @@ class Agent(Driver):
         if Path(path).suffix != ".safetensors":
             raise UsageError(f"save to a file whose name ends in .safetensors, not to '{path}'")
         weights = dict(self.policy.state_dict())  # type: ignore[attr-defined]
-        config = self.config.model_copy(update={"scene": self.trained_in})
+        config = self.config.model_copy(update={"scene": self.trained_in or self.config.scene})
         state = {"frames": self.frames, "config": config.plain()}
         save_checkpoint(path, state | {"policy": packed(weights) if small else weights})
 

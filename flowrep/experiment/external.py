@@ -117,12 +117,14 @@ def _module(name: str) -> Any:
     folder = path.parent
     for loaded, module in list(sys.modules.items()):
         file = Path(getattr(module, "__file__", None) or "/")
-        is_beside_another = {file.parent, file.parent.parent} & (_FOLDERS - {folder})
-        if is_beside_another and any((folder / own).exists() for own in (loaded, f"{loaded}.py")):
-            raise PolicyError(
-                f"would import {file} instead of the module '{loaded}' beside it: evaluate it "
-                "with a command of its own"
-            )
+        if not {file.parent, file.parent.parent} & (_FOLDERS - {folder}):
+            continue
+        for same in (folder / f"{loaded}.py", folder / loaded / "__init__.py"):
+            if same.is_file() and not same.samefile(file):
+                raise PolicyError(
+                    f"would import {file} instead of {same}: evaluate the two policies in separate "
+                    "commands"
+                )
     _FOLDERS.add(folder)
     sys.path.insert(0, str(folder))  # as Python does for a script
     spec = spec_from_file_location(f"flowrep_policy_{path.stem}", path)

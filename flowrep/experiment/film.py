@@ -210,7 +210,7 @@ class Film:
         spec, in_units = self.env.observation_spec[name], self._in_units(name)
         height, width = self._tile_size
         if spec.shape[-2] * width != spec.shape[-1] * height:
-            return  # it has no place in a strip of the camera's pictures
+            return  # it doesn't fit a strip of the camera's pictures
         if frames_of := {"seg2": "seg", "depth2": "depth"}.get(name):
             tile, count = self.tiles[frames_of], int(self._options(name)["k"])
             tile = tile._replace(about=f"{tile.about} The last {count} frames, oldest first.")

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from flowrep.geometry.checks import check_name, check_shape, common_batch, first_wrong, over_points
 
-P = ParamSpec("P")
-R = TypeVar("R")
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 
 PoseLayout: TypeAlias = Literal[
     "matrix", "matrix_3x4", "xyz_xyzw", "xyz_wxyz", "xyz_yaw", "xyz_yaw_pitch"
@@ -42,11 +42,11 @@ _OPENCV_AXES = {
 _OPPOSITE_WORLD_AXIS = {"unreal": 1, "unity": 2}
 
 
-def without_autocast(function: Callable[P, R]) -> Callable[P, R]:
+def without_autocast(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Lets a function compute as without autocast, which would round metres to bfloat16."""
 
     @functools.wraps(function)
-    def exact(*args: P.args, **kwargs: P.kwargs) -> R:
+    def exact(*args: _P.args, **kwargs: _P.kwargs) -> _R:
         kinds = {x.device.type for x in (*args, *kwargs.values()) if isinstance(x, Tensor)}
         with torch.autocast("cuda" if "cuda" in kinds else "cpu", enabled=False):
             return function(*args, **kwargs)

@@ -183,7 +183,8 @@ class AdaptFlow(MapTransform):
     | flow | `"raw"` | float `[*B, 2, H, W]` | any | px/step |
     | `"flow_valid"`, if there | | | | |
 
-    Where flow's mask is False, raw is nan, which `FlowFactorize` takes as unknown.
+    Where flow's mask (not read with `channels_last`) is False, raw is nan, which `FlowFactorize`
+    takes as unknown.
 
     Convention and further arguments: see `flowrep.geometry.adapt_flow`.
 

@@ -136,7 +136,9 @@ class MapTransform(Transform):
 
     def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
         """Returns the inputs of `compute`; a subclass may check their values."""
-        maps = self._inputs(tensordict)
+        return self._with_signed_ids(self._inputs(tensordict))
+
+    def _with_signed_ids(self, maps: Sequence[Tensor]) -> list[Tensor]:
         kinds = (reads.kind for reads in self.reads)
         return [x.to(signed(x.dtype)) if k == "integer" else x for x, k in zip(maps, kinds)]
 
@@ -214,10 +216,7 @@ class RecurrentTransform(MapTransform):
 
     @property
     def carried_keys(self) -> list[NestedKey]:
-        """The keys of the previous step that `advance` needs: by default the inputs.
-
-        Each has the dtype of the input at its place.
-        """
+        """The keys of the previous step that `advance` needs: by default the inputs."""
         return self.in_keys
 
     def compute(self, *now: Tensor) -> tuple[Tensor, ...]:
@@ -230,13 +229,9 @@ class RecurrentTransform(MapTransform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         now, before = self._read(next_tensordict), self._carried(tensordict)
-        for key, then, value in zip(self.carried_keys, before, now):
-            if then.dtype != value.dtype:
-                raise ValueError(
-                    f"representation {self.label}: {key!r} of the previous step is {then.dtype}, "
-                    f"and what is read now {value.dtype}: what converts it afterwards has to write "
-                    "to another key"
-                )
+        if self.carried_keys == self.in_keys:
+            for key, then, value in zip(self.in_keys, before, now):
+                check_unconverted(key, then, value)
         outputs = self.advance(before, now)
         env = self.parent
         if env is not None and env.__dict__.get("_torchrl_native_autoreset", False):
@@ -256,7 +251,7 @@ class RecurrentTransform(MapTransform):
                     f"representation {self.label} needs {key!r} of the previous step: pass step "
                     f"the TensorDict of reset or step_mdp, and let no later transform drop {key!r}"
                 )
-        return before
+        return self._with_signed_ids(before) if self.carried_keys == self.in_keys else before
 
     def _first_where(
         self, begins: Tensor, now: Sequence[Tensor], outputs: Sequence[Tensor]
@@ -343,8 +338,8 @@ class RecurrentTransform(MapTransform):
             if later and (keys := [key for key in self.carried_keys if key in transform.out_keys]):
                 raise ValueError(
                     f"{type(transform).__name__} writes to {keys[0]!r}, which "
-                    f"{type(self).__name__} before it reads again at the next step: give it other "
-                    "out_keys"
+                    f"{type(self).__name__}, an earlier transform, reads again at the next step: "
+                    "let it write to another key, or put it first"
                 )
             later = later or transform is self
 
@@ -385,6 +380,15 @@ def flags_of_batch(flags: Tensor, tensordict: TensorDictBase) -> Tensor:
 def _compiled(compute: Callable[..., tuple[Tensor, ...]]) -> Callable[..., tuple[Tensor, ...]]:
     """Returns a class's compiled `compute`, cached here so that instances can be pickled."""
     return torch.compile(compute, fullgraph=True)
+
+
+def check_unconverted(key: NestedKey, before: Tensor, now: Tensor) -> None:
+    """Raises ValueError if the previous step's value of a key has another dtype than this one's."""
+    if before.dtype != now.dtype:
+        raise ValueError(
+            f"{key!r} of the previous step is {before.dtype}, and that of this step {now.dtype}: "
+            "what converts it afterwards has to write to another key"
+        )
 
 
 def signed(dtype: torch.dtype) -> torch.dtype:

@@ -303,14 +303,17 @@ class EstimatedFlow(FlowTransform):
         batch, size = pair.shape[:-3], pair.shape[-2:]
         self._map_size(pair, *camera)
         previous, current = pair.to(torch.uint8).reshape(-1, 6, *size).chunk(2, -3)
-        # After a reset both pictures are the same. Nothing has moved, whatever an estimator says.
+        # After a reset both pictures are the same. Nothing moves by itself, whatever an estimator
+        # says.
         differs = (current != previous).flatten(1).any(1).reshape(-1, 1, 1, 1)
         if camera:
             _, depth, motion, K, prev_K = self._at_one_precision([pair, *camera])
             ego, seen = geometry.ego_flow(depth, K, motion, prev_K=prev_K)
             ego = ego.float().reshape(-1, 2, *ego.shape[-2:])
             flow = self._compensated(current, previous, ego, seen.reshape(-1, 1, *ego.shape[-2:]))
-            flow = torch.where(differs, flow, ego)  # also a plain wall, which the camera passes
+            # They are also the same of a plain wall, which moves as the camera says.
+            seen = seen.reshape(-1, 1, *ego.shape[-2:])
+            flow = torch.where(differs, flow, torch.where(seen, ego, math.nan))
         else:
             flow = torch.where(differs, self._averaged(self._estimate(current, previous)), 0.0)
         known = flow.isfinite().all(-3, keepdim=True)

@@ -151,7 +151,8 @@ class CameraTransform(MapTransform):
         if self._needs_one_camera:
             key = self.camera_keys[0]
             before, now = (td.get(key, None) for td in (tensordict, next_tensordict))
-            if before is None and now is not None:  # a later transform dropped it
+            # A later transform may have dropped it. On a GPU, not every call looks at K.
+            if before is None and now is not None and now.is_cpu:
                 _, last = self._checked.get(key, (None, None))
                 before = last if last is not None and last.shape == now.shape else None
             # Where an episode is done, an env with autoreset returns the next one's first frame.
@@ -214,7 +215,8 @@ class FlowTransform(CameraTransform):
         keys = as_keys(list(outputs) if out_keys is None else out_keys)
         super().__init__(intrinsics, reads, in_keys, keys, len(outputs), prev_intrinsics)
         self.outputs = tuple(outputs)
-        self.masks = [mask_key(key) for name, key in zip(outputs, keys) if name in self.masked]
+        masks = [mask_key(key) for name, key in zip(outputs, keys) if name in self.masked]
+        self.masks = [key for key in masks if key not in keys]
         self.out_keys: list[NestedKey] = [*keys, *self.masks]
         flows = [output for output in outputs if output != "valid"]
         self.scales = _scales(scale, flows)
@@ -232,13 +234,16 @@ class FlowTransform(CameraTransform):
         # With two keys, K and the previous K are the last of the maps already.
         return maps if len(self.camera_keys) == 2 else [*maps, None]
 
-    def _chosen(self, flows: Mapping[str, Tensor], valid: Tensor) -> tuple[Tensor, ...]:
-        """Returns the chosen outputs, flows times their scales, and the masks."""
+    def _chosen(
+        self, flows: Mapping[str, Tensor], valid: Tensor, mask: Tensor | None = None
+    ) -> tuple[Tensor, ...]:
+        """Returns the chosen outputs, flows times their scales, and masks, by default `valid`."""
+        mask = valid if mask is None else mask
         scaled = {
             name: flows[name] if scale == 1.0 else flows[name] * scale
             for name, scale in self.scales.items()
         }
-        return (*(scaled.get(name, valid) for name in self.outputs), *[valid] * len(self.masks))
+        return (*(scaled.get(name, valid) for name in self.outputs), *[mask] * len(self.masks))
 
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
         """Returns an unbounded spec for each flow and a boolean one for each mask."""
@@ -425,10 +430,11 @@ class FlowFactorize(FlowTransform):
             ego, valid = geometry.ego_flow(depth, K, motion, prev_K=prev_K)
             return self._chosen({"ego": ego}, valid)
         ego, obj, valid = geometry.factorize(raw[0], depth, K, motion, prev_K=prev_K)
-        flows = {"ego": ego, "obj": obj}
+        flows, known = {"ego": ego, "obj": obj}, None
         if "raw" in self.outputs:
             flows["raw"] = torch.where(raw[0].isfinite(), raw[0], 0.0)
-        return self._chosen(flows, valid)
+            known = raw[0].isfinite().all(-3, keepdim=True)
+        return self._chosen(flows, valid, known)
 
 
 def _is_equal(a: Tensor, b: Tensor) -> bool:
@@ -454,12 +460,12 @@ def masked_flow(flow: Tensor, key: NestedKey, tensordict: TensorDictBase) -> Ten
     if known is None:
         return flow
     shape = flow[..., :1, :, :].shape
-    if known.dtype != torch.bool or known.shape != shape:
+    if known.is_floating_point() or known.shape != shape:
         raise ValueError(
-            f"key {mask_key(key)!r}, the mask of {key!r}, should be bool {list(shape)}; got "
-            f"{known.dtype} {list(known.shape)}"
+            f"key {mask_key(key)!r}, the mask of {key!r}, should be bool or whole numbers "
+            f"{list(shape)}; got {known.dtype} {list(known.shape)}: convert or rename it"
         )
-    return torch.where(known, flow, math.nan)
+    return torch.where(known.bool(), flow, math.nan)
 
 
 def mask_key(flow: NestedKey) -> NestedKey:

@@ -10,7 +10,13 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
 
 from flowrep.geometry.checks import checked_count
-from flowrep.transforms.base import Keys, Reads, RecurrentTransform, check_distinct_keys
+from flowrep.transforms.base import (
+    Keys,
+    Reads,
+    RecurrentTransform,
+    check_distinct_keys,
+    check_unconverted,
+)
 
 
 class FrameStack(RecurrentTransform):
@@ -42,8 +48,8 @@ class FrameStack(RecurrentTransform):
         out_keys: one key for each stack, other than the maps' keys.
 
     Raises:
-        ValueError: `k` is less than 1, or a stack has the key of a map; in an env, a later
-            transform changes a stack.
+        ValueError: `k` is less than 1, or a stack has the key of a map; a later
+            transform of the same `TransformedEnv` changes a stack.
         MissingKey: in calls, the previous step or the trajectory is missing.
 
     Example:
@@ -76,6 +82,8 @@ class FrameStack(RecurrentTransform):
 
     def advance(self, before: Sequence[Tensor], now: Sequence[Tensor]) -> tuple[Tensor, ...]:
         """Returns the previous stacks without their oldest frames, followed by the new frames."""
+        for key, stack, frame in zip(self.out_keys, before, now):
+            check_unconverted(key, stack, frame)
         return tuple(
             torch.cat([stack[..., frame.shape[-3] :, :, :], frame], -3)
             for stack, frame in zip(before, now)

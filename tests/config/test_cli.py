@@ -2,6 +2,7 @@
 
 import random
 import shlex
+import shutil
 import sys
 from pathlib import Path
 
@@ -217,7 +218,7 @@ def test_a_scene_file_that_kept_the_name_of_its_original_is_refused(run, tmp_pat
     assert run("train", *line)[0] == 0
 
 
-def test_a_file_in_whose_place_hydra_reads_another_is_named(run, tmp_path):
+def test_a_file_that_hydra_finds_in_conf_first_is_named(run, tmp_path):
     (tmp_path / "scene").mkdir()
     original = (CONF_DIR / "scene" / "s_turn.yaml").read_text()
     mine = tmp_path / "scene" / "s_turn.yaml"
@@ -225,9 +226,23 @@ def test_a_file_in_whose_place_hydra_reads_another_is_named(run, tmp_path):
     assert run("train", "--config-dir", str(tmp_path))[0] == 0
     mine.write_text(original + "# mine\n")
     for line in (["--config-dir", str(tmp_path)], [f"hydra.searchpath=[file://{tmp_path}]"]):
-        code, found, said = run("train", *line)
+        assert run("train", *line)[0] == 0  # in another scene
+        code, found, said = run("train", *line, "scene=s_turn")
         assert (code, found) == (2, [])
         assert f"error: {mine} is not read" in said.err
+
+
+def test_a_folder_of_ones_own_may_hold_other_projects_files_or_stand_for_conf(run, tmp_path):
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "train.yaml").write_text("lr: 3\n")
+    own = (CONF_DIR / "scene" / "s_turn.yaml").read_text().replace("name: s_turn", "name: alley", 1)
+    (tmp_path / "scene" / "alley.yaml").write_text(own)
+    assert run("train", "--config-dir", str(tmp_path), "scene=alley")[0] == 0
+    whole = tmp_path / "conf"
+    shutil.copytree(CONF_DIR, whole)
+    with (whole / "scene" / "s_turn.yaml").open("a") as file:
+        file.write("# changed\n")
+    assert run("train", f"--config-path={whole}", "scene=s_turn")[0] == 0
 
 
 def test_an_installed_command_finds_modules_in_the_current_folder(run, monkeypatch, tmp_path):

@@ -75,6 +75,8 @@ def test_what_is_saved_is_the_config_of_the_training_not_of_another_scene(traine
     elsewhere.save(tmp_path / "agent.safetensors")
     again = Agent.load(tmp_path / "agent.safetensors", device="cpu")
     assert again.config.scene == agent.config.scene != elsewhere.config.scene
+    Agent(agent.policy, agent.config, 5).save(tmp_path / "by_hand.safetensors")
+    assert Agent.load(tmp_path / "by_hand.safetensors", device="cpu").frames == 5
 
 
 def test_the_threads_of_the_program_that_trains_stay_its_own(tmp_path):

@@ -78,9 +78,21 @@ def test_two_policies_do_not_share_what_lies_beside_one(tmp_path):
         (tmp_path / name / "mine.py").write_text(script)
     first = load_policy(f"{tmp_path}/first/mine.py:make", TASK)
     assert load_policy(f"{tmp_path}/first/mine.py:make", TASK)(maps())["action"].tolist() == [0, 0]
-    with pytest.raises(PolicyError, match=r"first/my_model\.py instead of the module 'my_model'"):
+    with pytest.raises(PolicyError, match=r"first/my_model\.py instead of .*second/my_model\.py"):
         load_policy(f"{tmp_path}/second/mine.py:make", TASK)
     assert first(maps())["action"].tolist() == [0, 0]
+
+
+def test_a_folder_of_data_or_a_shared_helper_is_in_no_policys_way(tmp_path):
+    for name in ("one", "other"):
+        (tmp_path / name).mkdir()
+        script = "import my_weights\nmake = lambda task: lambda maps: [0] * len(maps)"
+        (tmp_path / name / "mine.py").write_text(script)
+    (tmp_path / "one" / "my_weights.py").write_text("")
+    (tmp_path / "other" / "my_weights.py").symlink_to(tmp_path / "one" / "my_weights.py")
+    (tmp_path / "other" / "json").mkdir()
+    for name in ("one", "other"):
+        load_policy(f"{tmp_path}/{name}/mine.py:make", TASK)
 
 
 def test_a_program_that_torch_saved_is_a_policy(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.data import Unbounded
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
@@ -15,6 +16,7 @@ from flowrep.transforms import (
     FlowFactorize,
     RawFlow,
 )
+from flowrep.transforms.base import IDS, RecurrentTransform
 from tests.transforms.fake_env import FakeSensorEnv, frame_motions
 
 MOTION = "motion"
@@ -35,6 +37,38 @@ def test_a_step_from_an_earlier_tensordict_moves_from_its_pose():
     once = [second[MOTION][i, :3, :3].trace().item() for i in (0, 1)]
     assert all(far < near - 1e-4 for far, near in zip(turned, once))
     assert not camera_motion().state_dict()
+
+
+class Brightness(RecurrentTransform):
+    """The running sum of ids, a state of another type than its input."""
+
+    def __init__(self, carried):
+        super().__init__([IDS], ("sensor", "instance"), "sum")
+        self.carried = carried
+
+    @property
+    def carried_keys(self):
+        return [self.carried]
+
+    def advance(self, before, now):
+        return (before[0].float() + now[0].float(),)
+
+    def output_specs(self, ids):
+        return (Unbounded(ids.shape, dtype=torch.float32),)
+
+
+class WideIds(FakeSensorEnv):
+    def _observe(self):
+        seen = super()._observe()
+        seen["sensor", "instance"] = seen["sensor", "instance"].to(torch.uint16)
+        return seen
+
+
+@pytest.mark.parametrize("carried", ["sum", ("sensor", "instance")])
+@pytest.mark.parametrize("make", [FakeSensorEnv, WideIds])
+def test_a_state_may_be_of_another_type_and_ids_of_any(carried, make):
+    td = TransformedEnv(make(), Brightness(carried)).rollout(2)
+    assert td["next", "sum"].dtype == torch.float32
 
 
 def test_two_cameras_that_share_a_pose_s_key_are_refused():
