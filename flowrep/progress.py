@@ -63,9 +63,8 @@ class StopRequest:
 
     The first signal sets `received` and calls `then`. A second Ctrl-C ends the process at once; a
     second SIGTERM doesn't, since schedulers send it to each process of a job and more than once.
-    If SIGHUP is ignored, as under `nohup`, it stays so. In another thread than the main one it does
-    nothing. The previous handlers are restored when the
-    context ends.
+    If SIGHUP is ignored, as under `nohup`, it stays so. The previous handlers are restored when the
+    context ends. In another thread than the main one, a request never comes.
     """
 
     was_received: ClassVar[bool] = False

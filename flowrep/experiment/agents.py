@@ -77,9 +77,8 @@ class Agent(Driver):
             overrides: keys of conf/train.yaml and their values, such as `scene="s_turn"`,
                 `representations=["ego", "obj"]`, `preset="laptop"`, `total_frames=50_000` or
                 `evaluation={"every_frames": 0}`. To choose a section and also set a key in it, add
-                `**{"scene.time_limit_steps": 100}`. For a scene in a file
-                mine/scene/alley.yaml, add `**{"hydra.searchpath": ["file://mine"]}` to
-                `scene="alley"`.
+                `**{"scene.time_limit_steps": 100}`. For the scene in mine/scene/alley.yaml, add
+                `**{"hydra.searchpath": ["file://mine"]}` to `scene="alley"`.
 
         Raises:
             UsageError: a key or a value is wrong; the message names it.

@@ -115,6 +115,7 @@ def _module(name: str) -> Any:
         return import_module(name)
     path = Path(name).resolve(strict=True)
     folder = path.parent
+    # Under a name that an earlier script imported, Python would give this one the same module.
     for loaded, module in list(sys.modules.items()):
         file = Path(getattr(module, "__file__", None) or "/")
         if not {file.parent, file.parent.parent} & (_FOLDERS - {folder}):

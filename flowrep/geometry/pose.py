@@ -43,7 +43,7 @@ _OPPOSITE_WORLD_AXIS = {"unreal": 1, "unity": 2}
 
 
 def without_autocast(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Lets a function compute as without autocast, which would round metres to bfloat16."""
+    """Makes a function ignore autocast, which would round metres to bfloat16."""
 
     @functools.wraps(function)
     def exact(*args: _P.args, **kwargs: _P.kwargs) -> _R:

@@ -113,7 +113,7 @@ class DeclaredRecording(Recording):
             columns = None if self.rows_by == "order" else (0, 1)
             table, rows, *_ = self._rows(self.times, columns)
             if table.shape[1] > 1:
-                says = f"has {table.shape[1]} numbers in a row, expected seconds, with a point"
+                says = f"has {table.shape[1]} numbers in a row, expected one: seconds, with a point"
                 raise SequenceError(self._path(self.times), says)
             self._times_s = table[rows, 0] * self.time_unit_s
             left_out["without a time"] = rows < 0
@@ -149,9 +149,9 @@ class DeclaredRecording(Recording):
         return path.parent.is_dir() and any(path.parent.glob(name))
 
     def check_files(self, options: Collection[str]) -> None:
-        """Raises SequenceError if the files of one of these options, which may lack, are not there.
+        """Raises SequenceError if a file that one of these options names doesn't exist.
 
-        What a user names has to exist; what only a format names may be absent.
+        They are the options that the user gave: a file that only the format names may be absent.
         """
         for option in ("poses", "times", "flow", "flow_mask"):
             pattern = getattr(self, option)
@@ -249,8 +249,8 @@ class DeclaredRecording(Recording):
             keys = table[:, self.key_column]
             row_of = {key: row for row, key in enumerate(keys.tolist())}
             if len(row_of) < len(keys) or not np.isfinite(keys).all():
-                says = "two rows for one frame (choose with format.rows_where), or none's number"
-                raise SequenceError(path, f"has {says}")
+                says = "has two rows for one frame, or a frame's number that is nan or inf"
+                raise SequenceError(path, f"{says}: choose rows with format.rows_where")
             before = after = np.array([row_of.get(_number(name), -1) for name in self._names])
         elif len(table) != len(before):
             raise SequenceError(path, f"has {len(table)} rows for {len(before)} frames")
@@ -337,12 +337,9 @@ class DeclaredRecording(Recording):
         self._order = np.flatnonzero(kept)[:: -1 if self.backwards else 1]
         self.count, self.notes = len(self._order), tuple(notes)
         self._clips = np.cumsum(~kept) * self.has_flow  # its own flow does not skip a frame
-        values = self._times_s
-        if values is None:
-            values = np.array([float(_number(name)) for name in self._names])
-        self._positions = positions(values)
-        # Numbers tell which frame is missing, even if the times between frames vary.
         numbers = np.array([float(_number(name)) for name in self._names])
+        self._positions = positions(numbers if self._times_s is None else self._times_s)
+        # Numbers tell which frame is missing, even if the times between frames vary.
         are_numbers = (np.diff(numbers) > 0).all() and not any("." in name for name in self._names)
         self._numbers = positions(numbers) if are_numbers else self._positions
 

@@ -310,9 +310,9 @@ class EstimatedFlow(FlowTransform):
             _, depth, motion, K, prev_K = self._at_one_precision([pair, *camera])
             ego, seen = geometry.ego_flow(depth, K, motion, prev_K=prev_K)
             ego = ego.float().reshape(-1, 2, *ego.shape[-2:])
-            flow = self._compensated(current, previous, ego, seen.reshape(-1, 1, *ego.shape[-2:]))
-            # They are also the same of a plain wall, which moves as the camera says.
             seen = seen.reshape(-1, 1, *ego.shape[-2:])
+            flow = self._compensated(current, previous, ego, seen)
+            # Pictures of a plain wall are the same, too, though the camera moves.
             flow = torch.where(differs, flow, torch.where(seen, ego, math.nan))
         else:
             flow = torch.where(differs, self._averaged(self._estimate(current, previous)), 0.0)

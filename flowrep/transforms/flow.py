@@ -151,8 +151,9 @@ class CameraTransform(MapTransform):
         if self._needs_one_camera:
             key = self.camera_keys[0]
             before, now = (td.get(key, None) for td in (tensordict, next_tensordict))
-            # A later transform may have dropped it. On a GPU, not every call looks at K.
-            if before is None and now is not None and now.is_cpu:
+            # A later transform may have dropped it; the K of the last call is known on a CPU, where
+            # each call looks at it. Compiled resets look at frames that aren't kept, too.
+            if before is None and now is not None and now.is_cpu and not self.compiled:
                 _, last = self._checked.get(key, (None, None))
                 before = last if last is not None and last.shape == now.shape else None
             # Where an episode is done, an env with autoreset returns the next one's first frame.

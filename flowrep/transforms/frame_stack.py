@@ -48,8 +48,8 @@ class FrameStack(RecurrentTransform):
         out_keys: one key for each stack, other than the maps' keys.
 
     Raises:
-        ValueError: `k` is less than 1, or a stack has the key of a map; a later
-            transform of the same `TransformedEnv` changes a stack.
+        ValueError: `k` is less than 1, a stack has the key of a map, or a later transform of the
+            same `TransformedEnv` changes a stack.
         MissingKey: in calls, the previous step or the trajectory is missing.
 
     Example:

@@ -94,6 +94,9 @@ def write_video(path: str | Path, frames: Iterable[Image], *, fps: float) -> Non
     """Writes frames `[H, W, 3]` as an mp4, see `Video`; its folder is created if needed.
 
     The file appears when it is complete, in place of an earlier one.
+
+    Raises:
+        OSError: see `Video`; or there are no frames.
     """
 
     def write(partial: Path) -> None:
