@@ -361,6 +361,11 @@ def test_an_exported_agent_drives_as_it_did_in_flowrep(tmp_path):
         rows = own(name, tmp_path / maps[1:4], *asked_for)
         driven = [(row["episode_seed"], row["outcome"], row["return"]) for row in rows]
         assert driven == [(row["episode_seed"], row["outcome"], row["return"]) for row in mine]
+    by_default = {"ego": {}, "obj": None}  # the options of conf, which the agent had
+    scene = run.config().scene
+    agent = Agent.load(program, scene=scene, representations=by_default, device="cpu")
+    (first,) = agent.evaluate(1)
+    assert (str(first.episode_seed), first.outcome) == driven[0][:2]
 
 
 def test_a_policy_without_actions_leaves_a_line_and_no_row(tmp_path, capsys):

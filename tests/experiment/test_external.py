@@ -92,7 +92,8 @@ def test_a_folder_of_data_or_a_shared_helper_is_in_no_policys_way(tmp_path):
     (tmp_path / "other" / "my_weights.py").symlink_to(tmp_path / "one" / "my_weights.py")
     (tmp_path / "other" / "json").mkdir()
     for name in ("one", "other"):
-        load_policy(f"{tmp_path}/{name}/mine.py:make", TASK)
+        policy = load_policy(f"{tmp_path}/{name}/mine.py:make", TASK)
+        assert policy(maps())["action"].tolist() == [0, 0]
 
 
 def test_a_program_that_torch_saved_is_a_policy(tmp_path):

@@ -481,6 +481,10 @@ def test_the_unit_of_coded_depth_is_that_of_its_numbers(moments, tmp_path):
     for name in FRAMES:
         put(tmp_path / f"depth/{name}.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
     assert float(open_frames(tmp_path, depth_coding="rgb24").conventions["depth_unit_m"]) == 0.001
+    for name in FRAMES:  # the bytes of a float32 in each pixel
+        cv2.imwrite(str(tmp_path / f"depth/{name}.png"), np.zeros((HEIGHT, WIDTH, 4), np.uint8))
+    recording = open_frames(tmp_path, depth_coding="float32_rgba")
+    assert float(recording.conventions["depth_unit_m"]) == 1.0
 
 
 # Gaps.

@@ -74,7 +74,7 @@ def test_classes_take_their_colour_from_the_one_table():
 
 
 def test_ids_beyond_those_of_a_byte_are_unknown_too():
-    image = viz.classes_to_rgb(torch.tensor([[[-1, 255, 256, 260]]]))
+    image = viz.classes_to_rgb(torch.tensor([[[-2, -1, 255, 256, 260]]]))
     assert (image == 128).all()
 
 
