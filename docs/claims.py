@@ -53,7 +53,6 @@ class Contrast:
     asked: Mapping[str, Any]
     effect: Effect | None  # in the mean over scenes; None if a side has no run
     by_scene: Mapping[str, Effect]
-    fewest: int  # runs on a side in a scene
     p_value: float  # of the protocol's test
     p_against: float  # of what contradicts: for `equal`, a difference beyond the margin
     higher: float = float("nan")  # how often a run of the first side beats one of the second
@@ -131,15 +130,15 @@ def _over(
 ) -> Contrast:
     by_scene = {scene: effect(sides) for scene, sides in strata.items()}
     if not {*chosen} <= {*strata}:
-        return Contrast(asked, None, by_scene, 0, float("nan"), float("nan"))
+        return Contrast(asked, None, by_scene, float("nan"), float("nan"))
     pairs = [sides for scene in chosen for sides in strata[scene]]
-    together, fewest = effect(pairs), min(len(side) for sides in pairs for side in sides)
+    together = effect(pairs)
     if asked["expect"] == "equal":
         p_values = together.p_within(asked["margin"]), together.p_beyond(asked["margin"])
     else:
         p_values = together.p_value, together.p_value
     higher = improvement(pairs) if "second" in asked else float("nan")
-    return Contrast(asked, together, by_scene, fewest, *p_values, higher)
+    return Contrast(asked, together, by_scene, *p_values, higher)
 
 
 class Cell(NamedTuple):

@@ -85,8 +85,11 @@ def share(value: float) -> str:
     return "" if np.isnan(value) else f"{value:.2f}"
 
 
-def claims_table(claims: Sequence[Claim], p_name: str) -> str:
-    """Returns the table of claims in Markdown, a line for each contrast within a cell."""
+def claims_table(claims: Sequence[Claim], detectable: Sequence[float] | None = None) -> str:
+    """Returns the table of claims in Markdown, a line for each contrast within a cell.
+
+    Primary claims, whose p values are corrected, have the effects that would be detected.
+    """
     rows = []
     for claim in claims:
         effects = "<br>".join(map(effect_text, claim.contrasts))
@@ -96,9 +99,13 @@ def claims_table(claims: Sequence[Claim], p_name: str) -> str:
         )
         text = f"{claim.text}<br>*{claim.limits}*" if claim.limits else claim.text
         higher = "<br>".join(share(contrast.higher) for contrast in claim.contrasts)
-        rows.append((str(claim.number), text, f"**{claim.verdict}**", effects, higher, by_scene))
-    header = ("", "claim, *what limits it*", "verdict", f"effect [95 %], {p_name}", "P(higher)")
-    header += ("by scene",)
+        row = (str(claim.number), text, f"**{claim.verdict}**", effects, higher, by_scene)
+        rows.append(row if detectable is None else (*row, f"{detectable[len(rows)]:.0f}"))
+    header = ("", "claim, *what limits it*", "verdict")
+    if detectable is None:
+        header += ("effect [95 %], p (uncorrected)", "P(higher)", "by scene")
+    else:
+        header += ("effect [95 %], p (Holm)", "P(higher)", "by scene", "detectable")
     return _table(header, rows)
 
 
@@ -124,8 +131,8 @@ def _verdict_on(claim: Claim) -> tuple[str, str]:
 
 
 def held_out_table(found: Sequence[HeldOut]) -> str:
-    """Returns the table of claims on held-out speeds."""
-    rows = []
+    """Returns the table of claims on held-out speeds, with columns for collapsed runs if any."""
+    rows, some_collapsed = [], any(number for each in found for number in each.collapsed)
     for claim, permuted, collapsed, without in found:
         (contrast,) = claim.contrasts
         by_cell = (f"{name} {signed(e.value)}" for name, e in contrast.by_scene.items())
@@ -134,18 +141,22 @@ def held_out_table(found: Sequence[HeldOut]) -> str:
         number, text = f"H{claim.number}", f"{claim.text}: {sides}"
         tested = f"**{claim.verdict}**", effect_text(contrast), p_text(permuted)
         cells = ", ".join(cell.replace(" ", _TIED) for cell in by_cell)
-        rows.append((number, text, *tested, cells, " and ".join(map(str, collapsed)), left_out))
+        rows.append((number, text, *tested, cells))
+        if some_collapsed:
+            rows[-1] += (" and ".join(map(str, collapsed)), left_out)
     header = ("", "claim", "verdict", "effect [95 %], p (Holm)", "p by permutation")
-    return _table((*header, "by split and scene", "collapsed", "without these"), rows)
+    header += ("by split and scene", *(("collapsed", "without these") if some_collapsed else ()))
+    return _table(header, rows)
 
 
 def beside_table(found: Sequence[Mapping[str, Contrast]]) -> str:
     """Returns the secondary contrasts of the claims on held-out speeds."""
-    rows = [
-        (f"H{number}", *(points(c.effect.interval()) if c.effect else "" for c in of.values()))
-        for number, of in enumerate(found, start=1)
-    ]
+    rows = [(f"H{number}", *map(_points, of.values())) for number, of in enumerate(found, start=1)]
     return _table(("", *found[0]), rows)
+
+
+def _points(contrast: Contrast) -> str:
+    return points(contrast.effect.interval()) if contrast.effect else ""
 
 
 def cell_table(cell: Cell) -> str:
@@ -445,11 +456,12 @@ def runs_table(studies: Studies) -> str:
 def smallest_differences(claims: Sequence[Claim]) -> list[float]:
     """Returns the true difference that each contrast detects with a power of 80 %, in points.
 
-    The level is the one that Holm's method demands of the smallest p: 5 % over their number.
+    The level is the one that Holm's method demands of the smallest p: 5 % over their number. It is
+    nan for a contrast that can't be tested.
     """
-    effects = [x.effect for claim in claims for x in claim.contrasts if x.effect]
-    errors = [(x.error, stats.t(x.freedom)) for x in effects if not np.isnan(x.error)]
-    level = LEVEL / max(len(errors), 1)
+    effects = [x.effect for claim in claims for x in claim.contrasts]
+    errors = [(e.error, stats.t(e.freedom)) if e else (np.nan, stats.t(1)) for e in effects]
+    level = LEVEL / max(sum(not np.isnan(error) for error, _ in errors), 1)
     return [100 * error * float(t.ppf(1 - level / 2) + t.ppf(_POWER)) for error, t in errors]
 
 
@@ -500,6 +512,9 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
         return effect_text(contrast_of(asked, studies[study], [*studies[study]]))
 
     every = [run for of in main.values() for run in of]
+    asked = [contrast.asked for claim in primary for contrast in claim.contrasts]
+    stacks = {each.get(side) for each in asked for side in ("first", "second")}
+    decisive = [r for r in every if r.scene in declared["scenes"] and r.stack in stacks]
     failed = [r for r in every if _share(r.under(_as_trained(r))["outcome"]) < _HARDLY_EVER]
     with (DATA / EARLIER).open(encoding="utf-8", newline="") as file:
         earlier = {int(row["row"]): row for row in csv.DictReader(file)}
@@ -507,17 +522,23 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
     figures = {FIGURE: draw_claims([*primary, *secondary])}
     if cells:
         figures[HELD_OUT_FIGURE] = draw_held_out(cells)
-    smallest = smallest_differences(primary) or [float("nan")]
+    held_out, others = held_out_claims(declared, cells), beside_held_out(declared, cells)
+    detectable = smallest_differences(primary)
     text = (
         TEMPLATES.overlay(loader=FileSystemLoader(HERE))
         .get_template("results.md.jinja")
         .render(
-            primary=claims_table(primary, "p (Holm)"),
-            secondary=claims_table(secondary, "p"),
+            primary=claims_table(primary, detectable),
+            secondary=claims_table(secondary),
+            detectable=detectable,
+            decisive=len(decisive),
             recipes=recipes_table(primary, earlier, in_its_scenes("laptop")),
             later_scenes=[words(scene) for scene in studies["laptop"]],
-            held_out=held_out_table(held_out_claims(declared, cells)) if cells else "",
-            beside=beside_table(beside_held_out(declared, cells)) if cells else "",
+            held_out=held_out_table(held_out) if cells else "",
+            effects=[_points(each.claim.contrasts[0]) for each in held_out],
+            any_collapsed=any(number for each in held_out for number in each.collapsed),
+            beside=beside_table(others) if cells else "",
+            others=[{name: _points(c) for name, c in of.items()} for of in others],
             held_out_runs=sum(len(cell.runs) for cell in cells),
             above=above_the_planner(cells),
             held_out_seeds=sorted({run.seed for cell in cells for run in cell.runs}),
@@ -540,15 +561,9 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
             runs=runs_table({s: of for s, of in studies.items() if s not in declared["estimates"]}),
             commands={study: c for study, c in declared["commands"].items() if studies[study]},
             number=len(runs),
-            pixels=sorted(
-                {"{height_px} × {width_px}".format(**r.config["scene"]["camera"]) for r in every}
-            ),
-            frames=" or ".join(f"{n:,}" for n in sorted({run.total_frames for run in every})),
             failed=[f"{_stack(r.stack)} in {SHORT[r.scene]} (seed {r.seed})" for r in failed],
             without=without(failed, declared, studies),
             episodes=sum(len(run.episodes["outcome"]) for run in runs),
-            fewest=min(c.fewest for claim in primary for c in claim.contrasts),
-            smallest=f"{min(smallest):.0f} to {max(smallest):.0f}",
             sampled=sampled_minus_greedy(every),
             short=of_bfloat16(every),
             main_runs=len(every),

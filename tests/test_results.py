@@ -148,7 +148,7 @@ def test_alike_means_within_the_margin(value, error, verdict):
 
 def equal_by(found, margin=0.05):
     asked = HIGH | {"expect": "equal", "margin": margin}
-    return Contrast(asked, found, {}, 3, found.p_within(margin), found.p_beyond(margin))
+    return Contrast(asked, found, {}, found.p_within(margin), found.p_beyond(margin))
 
 
 def test_a_claim_of_equality_shows_the_p_of_what_its_effect_suggests():
@@ -170,7 +170,7 @@ def test_what_contradicts_is_corrected_with_the_others():
 
 
 def test_a_claim_of_several_contrasts_may_hold_in_part():
-    held = Contrast(HIGH, Effect(0.5, 0.01, 5.0), {}, 3, 0.001, 0.001)
+    held = Contrast(HIGH, Effect(0.5, 0.01, 5.0), {}, 0.001, 0.001)
     unseen, against = replace(held, p_value=0.5), replace(held, effect=Effect(-0.5, 0.01, 5.0))
     for contrasts, verdict in (
         ((held, unseen), "holds in part"),
