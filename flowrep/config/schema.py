@@ -43,7 +43,7 @@ from flowrep.options import (
 Model = TypeVar("Model", bound=BaseModel)
 
 CountOrZero = Annotated[int, Field(ge=0, le=2**53)]
-Seed = Annotated[int, Field(ge=0, lt=2**31)]  # larger ones are more than numpy takes
+Seed = Annotated[int, Field(ge=0, lt=2**31)]  # every library's generator takes these
 SpeedMode = Literal["low", "normal", "high"]
 FrameRate = Annotated[float, Field(ge=0.5, le=1000)]
 BaselineName = Literal["planner", "speed_blind", "never_turn", "random"]

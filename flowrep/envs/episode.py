@@ -33,6 +33,9 @@ class Outcome(IntEnum):
         return self.name.lower()
 
 
+# Seeds of episodes are smaller: int64 holds them, and spaces that hold all of int64's numbers can't
+# be sampled.
+EPISODE_SEEDS = 1 << 62
 NOTHING_HIT = 255  # value of `hit` without a collision; no class has this id
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium import spaces
 
-from flowrep.envs.episode import Episode, Moment, Outcome, reward
+from flowrep.envs.episode import EPISODE_SEEDS, Episode, Moment, Outcome, reward
 from flowrep.envs.sensing import SENSORS, Sensing
 from flowrep.scenes.load import load_scene
 from flowrep.scenes.scene import FRAME_RATES_HZ, Range, Scene, SpeedMode, num_classes
@@ -181,9 +181,8 @@ class StreetEnv(gym.Env):
         if not 0 <= _number(vehicle_speed_mps) < math.inf:
             raise ValueError(f"vehicle_speed_mps is {vehicle_speed_mps!r}; give m/s, 0 for rest")
         episode_seed = options["episode_seed"]
-        # TensorDicts hold it as int64.
-        if not hasattr(episode_seed, "__index__") or not 0 <= episode_seed < 1 << 63:
-            raise ValueError(f"episode_seed is {episode_seed!r}; give an int, 0 to 2**63 - 1")
+        if not hasattr(episode_seed, "__index__") or not 0 <= episode_seed < EPISODE_SEEDS:
+            raise ValueError(f"episode_seed is {episode_seed!r}; give an int, 0 to 2**62 - 1")
         self._episode = Episode(
             self._street.layout,
             checked_frame_rate(self.scene, options.get("frame_rate_hz", self.frame_rate_hz)),

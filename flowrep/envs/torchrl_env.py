@@ -130,9 +130,10 @@ def make_env(
     loaded = load_scene(scene)
     # An estimator and its pictures need one scale; that of a mapping counts.
     if flow == "estimated":
-        flow = {"source": flow, "picture_scale": picture_scale}
-    if isinstance(flow, Mapping):
-        picture_scale = flow.get("picture_scale", picture_scale)
+        flow = {"source": flow}
+    if isinstance(flow, Mapping) and flow.get("source") == "estimated":
+        flow = {"picture_scale": picture_scale, **flow}
+        picture_scale = flow["picture_scale"]
     drawn: Any = {"renderer": choose_renderer(renderer), "picture_scale": picture_scale}
     street = partial(StreetEnv, loaded, speed, frame_rate_hz, **drawn)
     frame_rate_hz = checked_frame_rate(loaded, frame_rate_hz)

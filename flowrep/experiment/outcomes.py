@@ -25,7 +25,10 @@ if TYPE_CHECKING:
     from flowrep.config.schema import TrainConfig
 
 OUTCOMES = ("success", "collision", "out_of_bounds", "timeout")
-"""How an episode can end. Repeated here, since `flowrep.envs`, which defines it, needs PyTorch."""
+"""How an episode can end: `flowrep.envs.Outcome` without its code 0.
+
+Repeated here, since `flowrep.envs` imports PyBullet, which a report or a sweep doesn't need.
+"""
 
 CAUSES = ("out of bounds", "collision: pedestrian", "collision: other", "timeout")
 _FAILURE_GROUP = (

@@ -140,9 +140,9 @@ def camera_motion(
     across the edge counts.
 
     `valid` is False, and the motion is the prior, if fewer than 32 pixels are known, if they don't
-    determine all directions (sky alone, for instance, determines only rotation), or if flow is
-    noise: no motion fits it to 0.2 px, or better than chance allows. If a K or the prior isn't
-    finite, the motion is the identity.
+    determine all directions (sky alone, for instance, determines only rotation), if flow is noise
+    (no motion fits it to 0.2 px, or better than chance allows), or if a K is invalid (see
+    `ego_flow`). If the prior isn't finite, `valid` is False and the motion is the identity.
 
     Two failures don't show in the result. If more than half of the known pixels move as one body,
     the motion is relative to that body; a prior helps. And the covariance assumes independent

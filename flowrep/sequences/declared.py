@@ -315,6 +315,8 @@ class DeclaredRecording(Recording):
         if len(shift) == 3:
             shift = np.column_stack([np.eye(3), shift]).ravel()
         self._colour_from_depth = as_pose(shift, "colour_from_depth")
+        if depth is None and np.any(self._colour_from_depth != np.eye(4)):
+            raise SequenceError("colour_from_depth", "needs format.depth_intrinsics, too")
         return {"without intrinsics": lacking}
 
     def _numbers_in(self, given: str | Sequence[float]) -> Floats:

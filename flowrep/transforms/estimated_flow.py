@@ -292,6 +292,8 @@ class EstimatedFlow(FlowTransform):
         if intrinsics is not None:
             reads, keys = [*reads, base.DEPTH, base.MOTION], [*keys, *EGO_KEYS]
         keys = keys if in_keys is None else in_keys
+        if scale != 1.0 and "raw" not in outputs:
+            raise ValueError(f"scale={scale} is for raw, which outputs={list(outputs)} lacks")
         scales = {name: scale if name == "raw" else 1.0 for name in outputs}
         options = (outputs, scales, False, prev_intrinsics)
         super().__init__(intrinsics, reads, keys, out_keys, *options)

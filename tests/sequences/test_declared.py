@@ -442,6 +442,7 @@ def test_brackets_in_a_name_are_brackets(moments, tmp_path):
         ({"dept": "d/*"}, "dept: there is no such key"),
         ({"marker_from_cam": [0.1, 0.2, 0.3]}, "marker_from_cam: has 3 numbers"),
         ({"colour_from_depth": [1.0, 2.0]}, "colour_from_depth: has 2 numbers"),
+        ({"colour_from_depth": [0.1, 0.0, 0.0]}, "colour_from_depth: .*depth_intrinsics"),
     ],
 )
 def test_options_are_checked(given, named, moments, tmp_path):
