@@ -60,10 +60,7 @@ def save_checkpoint(path: str | os.PathLike[str], state: Mapping[str, Any]) -> N
         replace_file(path, partial(_write, tensors, metadata))
     except OSError as error:
         kept = "; the previous checkpoint is untouched" if path.exists() else ""
-        raise CheckpointError(
-            f"cannot write the checkpoint: {error}{kept}. Free some space or make the folder "
-            "writable"
-        ) from error
+        raise CheckpointError(f"cannot write the checkpoint: {error}{kept}") from error
 
 
 def _write(tensors: dict[str, Tensor], metadata: dict[str, str], path: Path) -> None:

@@ -367,13 +367,6 @@ class Reader(Options):
         """Returns the options by name, without the class."""
         return dict(self.model_extra or {})
 
-    @model_validator(mode="after")
-    def _has_what_it_needs(self) -> Reader:
-        # Not ???, which would not replace the value of the format that this one extends.
-        for key in [key for key, value in self.options().items() if value == "needed"]:
-            raise ValueError(f"{key} needs a value: format.{key}=...")
-        return self
-
 
 class FlowScale(Options):
     """Flow of full colour, pixels."""

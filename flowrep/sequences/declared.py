@@ -93,8 +93,9 @@ class DeclaredRecording(Recording):
 
     def __post_init__(self) -> None:
         self.folder = Path(self.folder)
+        # Not ???, which would not replace the value of the format that this one extends.
         for key in [key for key, value in vars(self).items() if value == "needed"]:
-            raise ValueError(f"{key} needs a value")
+            raise ValueError(f"format.{key} needs a value: format.{key}=...")
         if self.depth_unit_m is not None and not self.depth_unit_m > 0:
             raise ValueError(f"depth_unit_m is positive, got {self.depth_unit_m}")
         self.has_flow, self.no_flow = self._flow_fits()

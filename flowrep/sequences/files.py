@@ -70,7 +70,7 @@ def _natural(name: str) -> list[int | str]:
 
 def with_suffix(path: Path, kind: str) -> Path:
     """Returns a file's path, with the first suffix of its kind that exists if it has none."""
-    if path.name.lower().endswith(tuple(_SUFFIXES[kind])):
+    if path.name.lower().endswith(_SUFFIXES[kind]):
         return path
     paths = [path.with_name(path.name + suffix) for suffix in _SUFFIXES[kind]]
     return next((found for found in paths if found.exists()), path)
@@ -203,7 +203,7 @@ def read_depth(
         given = f"holds {stored.dtype} {list(stored.shape)}"
         wanted = "one channel of 16 bits or floats" if coding is None else f"depth_coding={coding}"
         raise SequenceError(path, f"{given}, expected {wanted}")
-    unit_m = (0.001 if is_whole else 1.0) if unit_m is None else unit_m
+    unit_m = _usual_unit_m(stored) if unit_m is None else unit_m
     depth = (stored * np.float64(unit_m)).astype(np.float32)
     if is_whole:
         depth[np.isin(stored, list(missing))] = np.nan
@@ -214,7 +214,11 @@ def read_depth(
 
 def usual_unit_m(path: Path, coding: DepthCoding | None = None) -> float:
     """Returns the metres of a 1 that a file stores: 0.001 for whole numbers, 1 for floats."""
-    return 0.001 if _without_coding(path, coding).dtype.kind in "ui" else 1.0
+    return _usual_unit_m(_without_coding(path, coding))
+
+
+def _usual_unit_m(stored: NDArray[Any]) -> float:
+    return 0.001 if stored.dtype.kind in "ui" else 1.0
 
 
 def _without_coding(path: Path, coding: DepthCoding | None) -> NDArray[Any]:

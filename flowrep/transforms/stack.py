@@ -34,10 +34,10 @@ _OPTIONS: dict[str, tuple[type[Transform], tuple[str, ...]]] = {
     "ego": (FlowFactorize, _FLOW_OPTIONS),
     "obj": (FlowFactorize, _FLOW_OPTIONS),
 }
-_FRAMES_OF = {"seg2": "seg", "depth2": "depth"}  # the last k frames
+FRAMES_OF = {"seg2": "seg", "depth2": "depth"}  # the last k frames
 FLOWS = ("raw", "ego", "obj")  # of two channels, u and v
 
-REPRESENTATIONS: tuple[str, ...] = (*_OPTIONS, *_FRAMES_OF)
+REPRESENTATIONS: tuple[str, ...] = (*_OPTIONS, *FRAMES_OF)
 
 _UNSCALED_KEY = "_raw"  # exact raw flow in px/step, for FlowFactorize
 _PICTURE_KEY = ("sensor", "rgb")
@@ -56,8 +56,8 @@ def representation_options(name: str) -> Options:
     {'k': 2, 'range_m': 100.0, 'missing': 0.0}
     """
     _check_known("representation", [name], REPRESENTATIONS)
-    stacked = _defaults(FrameStack, ("k",)) if name in _FRAMES_OF else {}
-    return stacked | _defaults(*_OPTIONS[_FRAMES_OF.get(name, name)])
+    stacked = _defaults(FrameStack, ("k",)) if name in FRAMES_OF else {}
+    return stacked | _defaults(*_OPTIONS[FRAMES_OF.get(name, name)])
 
 
 def _defaults(transform: type[Transform], names: Sequence[str]) -> Options:
@@ -269,10 +269,10 @@ def _maps(
     for name, options in chosen.items():
         if name in FLOWS:
             continue
-        if name not in _FRAMES_OF:
+        if name not in FRAMES_OF:
             maps.append(one(name, name, options))
             continue
-        frame = _FRAMES_OF[name]
+        frame = FRAMES_OF[name]
         of_frame = {option: value for option, value in options.items() if option != "k"}
         is_shared = chosen.get(frame) == of_frame
         key = frame if is_shared else f"_{frame}"

@@ -28,9 +28,9 @@ def open_kitti(folder):
 def test_kitti_needs_both_files_for_poses(tmp_path):
     synthetic.write_kitti(tmp_path)
     training = tmp_path / "training"
-    with pytest.raises(SequenceError, match="format.raw_data"):
+    with pytest.raises(SequenceError, match=r"format\.raw_data"):
         open_recording(training, "kitti", mapping=tmp_path / "train_mapping.txt")
-    with pytest.raises(SequenceError, match="format.mapping"):
+    with pytest.raises(SequenceError, match=r"format\.mapping"):
         open_recording(training, "kitti", raw_data=tmp_path / "raw")
 
 

@@ -50,7 +50,7 @@ def test_flow_is_now_minus_before_u_right_and_v_down(height, width):
 
 
 def test_a_scale_without_raw_is_refused():
-    with pytest.raises(ValueError, match="scale=2.0.*unscaled"):
+    with pytest.raises(ValueError, match=r"scale=2\.0.*unscaled"):
         T.EstimatedFlow(outputs=["unscaled"], scale=2.0)
 
 
