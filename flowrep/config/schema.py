@@ -25,18 +25,19 @@ from pydantic import (
     model_validator,
 )
 
+from flowrep.choices import FRAME_RATES_HZ, BaselineName, Renderer, SpeedMode
 from flowrep.config import UsageError
 from flowrep.options import (
     ALGORITHMS,
     CLASS,
     AlgorithmOptions,
     Count,
-    EstimatedFlow,
-    ExactFlow,
-    Noise,
+    EstimatedFlowOptions,
+    ExactFlowOptions,
+    NoiseOptions,
     Options,
     Positive,
-    Representations,
+    RepresentationOptions,
     Text,
 )
 
@@ -44,11 +45,8 @@ Model = TypeVar("Model", bound=BaseModel)
 
 CountOrZero = Annotated[int, Field(ge=0, le=2**53)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]  # every library's generator takes these
-SpeedMode = Literal["low", "normal", "high"]
-FrameRate = Annotated[float, Field(ge=0.5, le=1000)]
-BaselineName = Literal["planner", "speed_blind", "never_turn", "random"]
-Renderer = Literal["auto", "rasteriser", "pybullet"]
-MotionSource = Literal["exact", "estimated"]
+FrameRate = Annotated[float, Field(ge=FRAME_RATES_HZ[0], le=FRAME_RATES_HZ[1])]
+MotionChoice = Literal["exact", "estimated"]
 Device = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
 Workers = CountOrZero | Literal["auto"]
 
@@ -102,7 +100,7 @@ def _in_their_order(value: Any, check: Any) -> dict[str, Any]:
     return {name: dict(options) for name, options in value.items()}
 
 
-Flow = Annotated[ExactFlow | EstimatedFlow, Field(discriminator="source")]
+FlowSection = Annotated[ExactFlowOptions | EstimatedFlowOptions, Field(discriminator="source")]
 
 
 class ForeignAlgorithm(AlgorithmOptions):
@@ -144,7 +142,7 @@ if TYPE_CHECKING:
 else:
     Scene = Annotated[Any, BeforeValidator(_scene), PlainSerializer(_scene_data)]
     Stack = Annotated[
-        Representations, WrapValidator(_in_their_order), PlainSerializer(lambda value: value)
+        RepresentationOptions, WrapValidator(_in_their_order), PlainSerializer(lambda value: value)
     ]
     Algorithm = Annotated[
         Union[
@@ -184,9 +182,9 @@ class EnvConfig(Command):
     num_workers: Workers
     renderer: Renderer
     representations: Stack
-    flow: Flow
-    motion: MotionSource
-    noise: Noise
+    flow: FlowSection
+    motion: MotionChoice
+    noise: NoiseOptions
     scene: Scene
 
     @model_validator(mode="after")
@@ -271,9 +269,9 @@ class EvaluateConfig(Command):
     algorithm: Trusted
     scene: Scene | None = None
     representations: Stack | None = None
-    flow: Flow | None = None
-    motion: MotionSource | None = None
-    noise: Noise | None = None
+    flow: FlowSection | None = None
+    motion: MotionChoice | None = None
+    noise: NoiseOptions | None = None
     speed: Annotated[SpeedModes, OneOrMore]
     fps: Annotated[FrameRates | None, OneOrMore]
     episodes: Count
@@ -382,7 +380,7 @@ class FactorizeConfig(Command):
     input: Text | int
     output: Text
     format: Reader
-    flow: Flow
+    flow: FlowSection
     poses: Literal["recorded", "estimated"] | None
     check: Literal["error", "warn"]
     start: CountOrZero

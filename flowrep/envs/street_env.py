@@ -8,10 +8,11 @@ from typing import Any
 import gymnasium as gym
 from gymnasium import spaces
 
+from flowrep.choices import FRAME_RATES_HZ, SpeedMode
 from flowrep.envs.episode import EPISODE_SEEDS, Episode, Moment, Outcome, reward
 from flowrep.envs.sensing import SENSORS, Sensing
 from flowrep.scenes.load import load_scene
-from flowrep.scenes.scene import FRAME_RATES_HZ, Range, Scene, SpeedMode, num_classes
+from flowrep.scenes.scene import Range, Scene, num_classes
 from flowrep.scenes.vehicle import YAW_SIGN, VehicleState
 from flowrep.simulator.street import Street
 

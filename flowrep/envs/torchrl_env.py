@@ -11,13 +11,14 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import Compose, GymWrapper, TransformedEnv
 
+from flowrep.choices import SpeedMode
 from flowrep.envs.sensing import SENSORS
 from flowrep.envs.street_env import StreetEnv, checked_frame_rate
 from flowrep.envs.vector_env import StreetVectorEnv
 from flowrep.envs.workers import WorkerVectorEnv, available_cores
 from flowrep.geometry.checks import checked_count
 from flowrep.scenes.load import load_scene
-from flowrep.scenes.scene import Range, Scene, SpeedMode, num_classes
+from flowrep.scenes.scene import Range, Scene, num_classes
 from flowrep.scenes.vehicle import YAW_SIGN
 from flowrep.simulator.camera import choose_renderer, sensor_intrinsics
 from flowrep.transforms import Mirror, representation_stack

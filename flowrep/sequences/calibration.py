@@ -18,7 +18,7 @@ from flowrep.sequences.files import regular
 from flowrep.sequences.recording import Pose, SequenceError
 
 Matrix: TypeAlias = NDArray[np.float64]
-Layout: TypeAlias = Literal["matrix", "xyz_xyzw", "xyz_wxyz", "xyzw_xyz"]
+StoredPoseLayout: TypeAlias = Literal["matrix", "xyz_xyzw", "xyz_wxyz", "xyzw_xyz"]
 Lens: TypeAlias = Literal["opencv", "fisheye"]
 
 MIRROR_REMEDY = (
@@ -105,7 +105,7 @@ def as_pose(
     numbers: NDArray[np.float64],
     source: object,
     *,
-    layout: Layout = "matrix",
+    layout: StoredPoseLayout = "matrix",
     direction: PoseDirection = "camera_to_world",
     axes: CameraAxes = "opencv",
 ) -> Pose:

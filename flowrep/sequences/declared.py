@@ -69,7 +69,7 @@ class DeclaredRecording(Recording):
     pose_lag_frames: int
     leave_out: Sequence[str]
     backwards: bool
-    pose_layout: calibration.Layout
+    pose_layout: calibration.StoredPoseLayout
     pose_direction: geometry.PoseDirection
     pose_axes: geometry.CameraAxes
     marker_from_cam: Sequence[float] | None
@@ -416,13 +416,13 @@ class DeclaredRecording(Recording):
             depth[trust < self.min_confidence] = np.nan
         return depth
 
-    def _raw(self, pattern: str, name: str, other: str) -> files.Flow:
+    def _raw(self, pattern: str, name: str, other: str) -> files.FlowMap:
         stored = files.read_flow(self._file(pattern, "flow", name, next=other), self.flow_coding)
         # If it is read backwards, the next frame is the previous one.
         is_forward = (self.flow_direction == "forward") != (self.flow_to == "next")
         options: Any = {"grid": "current", "channels": self.flow_channels}
         options |= {"direction": "forward" if is_forward else "backward"}
-        raw: files.Flow = geometry.adapt_flow(torch.from_numpy(stored), **options).numpy()
+        raw: files.FlowMap = geometry.adapt_flow(torch.from_numpy(stored), **options).numpy()
         if self.flow_mask is not None:
             mask = self._file(self.flow_mask, "map", name, next=other)
             if mask.is_file():

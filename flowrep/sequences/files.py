@@ -21,7 +21,7 @@ from flowrep.sequences.recording import SequenceError
 
 DepthCoding: TypeAlias = Literal["float32_rgba", "rgb24"]
 FlowCoding: TypeAlias = Literal["kitti", "vkitti2", "kubric"]
-Flow: TypeAlias = NDArray[np.float32]  # [2, H, W], u right, v down; nan where unknown
+FlowMap: TypeAlias = NDArray[np.float32]  # [2, H, W], u right, v down; nan where unknown
 
 _SUFFIXES = {
     "picture": (".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".bmp", ".tif", ".tiff", ".npy"),
@@ -231,7 +231,7 @@ def _without_coding(path: Path, coding: DepthCoding | None) -> NDArray[Any]:
     return stored
 
 
-def read_flow(path: Path, coding: FlowCoding = "kitti") -> Flow:
+def read_flow(path: Path, coding: FlowCoding = "kitti") -> FlowMap:
     """Returns the first two channels of a file as flow `[2, H, W]`, nan where unknown.
 
     Args:
@@ -262,7 +262,7 @@ def read_flow(path: Path, coding: FlowCoding = "kitti") -> Flow:
     return flow
 
 
-def write_flo(path: Path, flow: Flow, valid: NDArray[np.bool_] | None = None) -> None:
+def write_flo(path: Path, flow: FlowMap, valid: NDArray[np.bool_] | None = None) -> None:
     """Writes flow `[2, H, W]`; invalid pixels get the format's value for unknown flow."""
     _, height, width = flow.shape
     known = np.isfinite(flow).all(0) & (valid is None or valid)
@@ -271,7 +271,7 @@ def write_flo(path: Path, flow: Flow, valid: NDArray[np.bool_] | None = None) ->
     path.write_bytes(header + marked.astype("<f4").tobytes())
 
 
-def write_kitti_flow(path: Path, flow: Flow) -> None:
+def write_kitti_flow(path: Path, flow: FlowMap) -> None:
     """Writes flow `[2, H, W]` in steps of 1/64 px; flow beyond 512 px is marked as unknown."""
     known = np.isfinite(flow).all(0)
     steps = np.rint(np.where(known, flow, 0.0) * 64) + 2**15

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from flowrep import viz
 from flowrep.extras import require
 from flowrep.sequences.factorization import FactorizedFrame, factorize_pair
-from flowrep.sequences.files import Flow, write_flo, write_kitti_flow, write_picture
+from flowrep.sequences.files import FlowMap, write_flo, write_kitti_flow, write_picture
 from flowrep.sequences.recording import Frame, Pose, SequenceError
 from flowrep.tables import append_rows
 
@@ -236,7 +236,7 @@ def _median(values: NDArray[np.float32]) -> float:
     return float(np.median(values)) if len(values) else math.nan
 
 
-def shown(kind: str, result: FactorizedFrame) -> Flow:
+def shown(kind: str, result: FactorizedFrame) -> FlowMap:
     """Returns a flow with nan where it is unknown, which is drawn in grey."""
     if kind == "raw":
         return result.raw
