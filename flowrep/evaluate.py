@@ -111,7 +111,7 @@ def evaluate_one(
     if not config.other_policies:  # whose networks may be large
         build.share_cores(agent.config)
     origin = agent.origin("evaluate")
-    # agents of one scene share the baselines' episodes
+    # Agents of one scene share the baselines' episodes.
     episodes = config.speed, frame_rates(config, agent), config.episodes, config.seed
     evaluation = evaluations.setdefault(
         f"{origin['scene_id']} {candidate.policies}",

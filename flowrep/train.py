@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from flowrep.experiment.run import RunFolder
     from flowrep.experiment.runner import Runner
 
-PATIENCE_S = 60.0  # a process that was told to stop may still be saving the run
+PATIENCE_S = 60.0  # a process that received a stop signal may still be saving the run
 
 
 class EarlyCheck(Callback):

@@ -46,8 +46,8 @@ def save_checkpoint(path: str | os.PathLike[str], state: Mapping[str, Any]) -> N
             any depth. Tuples come back as lists.
 
     Raises:
-        TypeError: if `state` holds anything else; the message names the key.
-        CheckpointError: if it can't be written (disk full, read-only). A previous file is kept.
+        TypeError: `state` holds anything else; the message names the key.
+        CheckpointError: it can't be written (disk full, read-only). A previous file is kept.
     """
     path = Path(path)
     tensors: dict[str, Tensor] = {}
@@ -80,7 +80,7 @@ def load_checkpoint(
     With `parts`, only these keys of the outermost dict are read.
 
     Raises:
-        CheckpointError: if the file is missing, damaged or not a checkpoint of this version.
+        CheckpointError: the file is missing, damaged or not a checkpoint of this version.
     """
     path = Path(path)
     if not path.is_file():

@@ -251,7 +251,7 @@ class TrainConfig(EnvConfig):
                 f"algorithm.{key}={value}: the first update would come after {frames} frames, "
                 f"and total_frames is {self.total_frames}: raise it, or lower algorithm.{key}"
             )
-        # a transition of all envs, and the step after it
+        # A transition of all envs, and the step after it.
         least = (1 + getattr(self.algorithm, "n_steps", 1)) * self.num_envs
         capacity = getattr(self.algorithm, "replay_capacity", least)
         if capacity < least:
@@ -314,7 +314,7 @@ class EvaluateConfig(Command):
             if key == "representations" and all(options.keys() == {"_target_"} for options in maps):
                 continue
             if not others and getattr(self, key) is not None:
-                raise ValueError(f"{key}= is for a policy of your own; a run has its own {key}")
+                raise ValueError(f"{key}= can't be combined with run=: a run has its own {key}")
         return self
 
 

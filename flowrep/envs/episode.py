@@ -78,9 +78,11 @@ class Episode:
     """The constants and the state of one drive.
 
     Args:
+        layout: the ground plan of the scene.
         frame_rate_hz: steps a second.
         episode_seed: seed of everything that is drawn: the path, and how people walk.
         speed_mps: lowest and highest speed of people whose group doesn't set its speed.
+        vehicle_speed_mps: the speed at which the vehicle drives.
         path: the name of the path; None draws one.
 
     Raises:

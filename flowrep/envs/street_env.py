@@ -121,7 +121,7 @@ class StreetEnv(gym.Env):
             try:
                 self._resume(options["state"])
             except (KeyError, TypeError) as error:
-                raise ValueError(f"the state is none that get_state returned: {error!r}") from error
+                raise ValueError(f"this is not a state returned by get_state: {error!r}") from error
         else:
             self._begin({"episode_seed": int(self.np_random.integers(1 << 31))} | options)
 

@@ -46,7 +46,13 @@ def sensors_read(transforms: Iterable[Any]) -> list[str]:
 
 
 class VectorWrapper(GymWrapper):
-    """TorchRL's wrapper; reset masks are optional, and moved to the CPU."""
+    """TorchRL's wrapper; reset masks are optional, and moved to the CPU.
+
+    Args:
+        env: the vector env of the streets.
+        scene: the scene of all its envs, kept as an attribute, as is `frame_rate_hz`.
+        kwargs: see `torchrl.envs.GymWrapper`.
+    """
 
     def __init__(
         self,
@@ -196,7 +202,7 @@ def begin_step(env: TransformedEnv, acted: TensorDictBase) -> None:
 
 
 def has_spare_cores(env: TransformedEnv, threads: int) -> bool:
-    """Returns whether there is a core for each of the env's workers and `threads` own threads."""
+    """Returns whether there is a core for each worker of the env and each of `threads` threads."""
     # If not, running both at once takes longer than one after the other: threads synchronise at
     # every operation, and all of them wait when one loses its core.
     return _vector(env).num_workers + threads <= available_cores()

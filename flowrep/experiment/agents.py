@@ -151,12 +151,14 @@ class Agent(Driver):
             names = {"representations": [*representations]}
             maps = composed(names)[0].representations
         if kind != "external":
-            # A `_target_` alone only trusts a class that a run names; `trusted` has it.
+            # `_target_` alone is no map: it trusts a class that a run names, as `trusted` says.
             chosen = [each for each in maps.values() if {*(each or {})} != {"_target_"}] or None
             given = {"representations": chosen, "flow": flow, "motion": motion, "noise": noise}
             for key, value in given.items():
                 if value is not None:
-                    raise UsageError(f"{key}= is for a policy of your own, not for policy={name}")
+                    raise UsageError(
+                        f"{key}= can't be combined with policy={name}, which has its own"
+                    )
         if kind in ("baseline", "external"):
             if precision is not None:
                 raise UsageError(f"precision= is for a trained agent, not for policy={name}")

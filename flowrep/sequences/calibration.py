@@ -154,9 +154,9 @@ class Undistortion:
     def __call__(self, image: Any, *, nearest: bool = False) -> Any:
         """Returns the rectified map; nan, or black, outside of the lens's picture."""
         border = np.nan if image.dtype.kind == "f" else 0.0
-        way = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
+        interpolation = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
         columns, rows = self._maps
-        return cv2.remap(image, columns, rows, way, borderValue=4 * [border])
+        return cv2.remap(image, columns, rows, interpolation, borderValue=4 * [border])
 
 
 _LARGEST_FOOTPRINT_PX = 8

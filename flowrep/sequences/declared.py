@@ -97,16 +97,19 @@ class DeclaredRecording(Recording):
         for key in [key for key, value in vars(self).items() if value == "needed"]:
             raise ValueError(f"format.{key} needs a value: format.{key}=...")
         if self.depth_unit_m is not None and not self.depth_unit_m > 0:
-            raise ValueError(f"depth_unit_m is positive, got {self.depth_unit_m}")
+            raise ValueError(f"depth_unit_m must be positive, got {self.depth_unit_m}")
         self.has_flow, self.no_flow = self._flow_fits()
         depths, depth_times_s = self._listing(self.depth, "map")
-        times_s, listed, rgb, self._video = depth_times_s, depths, self._path(self.rgb or "x"), None
+        listed, times_s = depths, depth_times_s
+        self._video: VideoPictures | None = None
         self._rgbs: list[Path] | None = None
-        if rgb.suffix.lower() in VIDEOS:
-            self._video = VideoPictures(rgb)
-        elif self.rgb is not None and (rgb.parent.is_dir() or not self.has_flow):
-            listed, times_s = self._listing(self.rgb, "picture")
-            self._rgbs = [*listed.values()]
+        if self.rgb is not None:
+            rgb = self._path(self.rgb)
+            if rgb.suffix.lower() in VIDEOS:
+                self._video = VideoPictures(rgb)
+            elif rgb.parent.is_dir() or not self.has_flow:
+                listed, times_s = self._listing(self.rgb, "picture")
+                self._rgbs = [*listed.values()]
         self._names, self._times_s = [*listed], times_s
         left_out = self._match_depth(depths, depth_times_s)
         if self.times is not None and self._exists(self.times):
@@ -212,7 +215,7 @@ class DeclaredRecording(Recording):
         if unpaired := {*ours} ^ {*theirs}:
             lacks = self.rgb if min(unpaired) in theirs else self.depth
             raise SequenceError(
-                self._path(lacks or "").parent, f"lacks frame {min(unpaired)}'s file"
+                self._path(lacks or "").parent, f"has no file for frame {min(unpaired)}"
             )
         self._depths = [dict(zip(theirs, depths.values()))[key] for key in ours]
         return {}
@@ -250,8 +253,8 @@ class DeclaredRecording(Recording):
             keys = table[:, self.key_column]
             row_of = {key: row for row, key in enumerate(keys.tolist())}
             if len(row_of) < len(keys) or not np.isfinite(keys).all():
-                says = "has two rows for one frame, or a frame's number that is nan or inf"
-                raise SequenceError(path, f"{says}: choose rows with format.rows_where")
+                says = "has two rows with the same frame number, or one that is nan or inf"
+                raise SequenceError(path, f"{says}; select rows with format.rows_where")
             before = after = np.array([row_of.get(_number(name), -1) for name in self._names])
         elif len(table) != len(before):
             raise SequenceError(path, f"has {len(table)} rows for {len(before)} frames")

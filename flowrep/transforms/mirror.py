@@ -139,7 +139,7 @@ class Mirror(Transform):
         return tensordict
 
     def _check_width(self, key: NestedKey, width: int) -> None:
-        # pictures for estimated flow may be several times as large as the camera's maps
+        # Pictures for estimated flow may be several times as large as the camera's maps.
         if self.twice_cx is not None and not width / 1.5 < self.twice_cx < width * 1.5:
             raise ValueError(
                 f"{key!r} is {width} pixels wide, but 2·cx is {self.twice_cx}: it is not of the "

@@ -462,7 +462,7 @@ def test_a_table_has_one_row_for_a_frame_s_number(key, moments, tmp_path):
     keyed = {"rows_by": "number", "times": None}
     assert len(open_frames(tmp_path, **keyed)) == 3
     put(tmp_path / "poses.txt", [*poses, f"{key} {numbers(np.eye(4))}"])
-    with pytest.raises(SequenceError, match=r"poses\.txt: has two rows for one frame"):
+    with pytest.raises(SequenceError, match=r"poses\.txt: has two rows"):
         open_frames(tmp_path, **keyed)
 
 
