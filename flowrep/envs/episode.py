@@ -33,9 +33,7 @@ class Outcome(IntEnum):
         return self.name.lower()
 
 
-# Seeds of episodes are smaller: int64 holds them, and spaces that hold all of int64's numbers can't
-# be sampled.
-EPISODE_SEEDS = 1 << 62
+EPISODE_SEEDS = 1 << 62  # seeds are smaller; a space of all numbers of int64 can't be sampled
 NOTHING_HIT = 255  # value of `hit` without a collision; no class has this id
 
 

@@ -156,9 +156,7 @@ class Agent(Driver):
             given = {"representations": chosen, "flow": flow, "motion": motion, "noise": noise}
             for key, value in given.items():
                 if value is not None:
-                    raise UsageError(
-                        f"{key}= can't be combined with policy={name}, which has its own"
-                    )
+                    raise UsageError(f"{key}= is for another project's policy, not for {name}")
         if kind in ("baseline", "external"):
             if precision is not None:
                 raise UsageError(f"precision= is for a trained agent, not for policy={name}")

@@ -25,10 +25,7 @@ if TYPE_CHECKING:
     from flowrep.config.schema import TrainConfig
 
 OUTCOMES = ("success", "collision", "out_of_bounds", "timeout")
-"""How an episode can end: `flowrep.envs.Outcome` without its code 0.
-
-Repeated here, since `flowrep.envs` imports PyBullet, which a report or a sweep doesn't need.
-"""
+"""How an episode can end. Repeated here, as `flowrep.envs`, which defines it, needs PyBullet."""
 
 CAUSES = ("out of bounds", "collision: pedestrian", "collision: other", "timeout")
 _FAILURE_GROUP = (
