@@ -111,7 +111,7 @@ def evaluate_one(
     if not config.other_policies:  # whose networks may be large
         build.share_cores(agent.config)
     origin = agent.origin("evaluate")
-    # agents of one scene share the baselines' episodes
+    # Agents of one scene share the baselines' episodes.
     episodes = config.speed, frame_rates(config, agent), config.episodes, config.seed
     evaluation = evaluations.setdefault(
         f"{origin['scene_id']} {candidate.policies}",
@@ -131,17 +131,15 @@ def evaluate_one(
                 folder.log_episodes(records, drives=True)
                 folder.write_failures()
             except OSError as error:
-                raise OSError(
-                    f"{folder.path}: {error}. Free some space or make the folder writable, then "
-                    "evaluate again"
-                ) from error
+                raise OSError(f"{folder.path}: {error}. Then evaluate again") from error
             print(folder.path)
             print_results([record.row() for record in records])
             print(f"{len(records)} of {evaluation.total} episodes are in {folder.evaluation_path}")
         if stop and len(records) < evaluation.total:
             print(
-                "stopped: a policy, speed and frame rate of which some episodes were missing is "
-                "left out, as short episodes end first; the same command runs all of them again"
+                "stopped: combinations of policy, speed and frame rate with missing episodes are "
+                "not saved, because short episodes end first and would bias them. The same command "
+                "runs them again"
             )
     film(config, agent, folder, stop)
 

@@ -14,6 +14,8 @@ from itertools import count
 from pathlib import Path
 from typing import IO, Any
 
+_REFUSED = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES)
+
 
 def replace_file(path: Path, write: Callable[[Path], Any]) -> None:
     """Calls `write` with another path, and renames the file to `path` once it is on disk.
@@ -86,24 +88,27 @@ def open_to_append(path: Path) -> IO[bytes]:
 
 def _open_no_link(path: str, flags: int) -> int:
     try:
-        # not blocking, as a named pipe would wait for a reader
+        # Not blocking, as a named pipe would wait for a reader.
         return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
     except OSError as error:
         if error.errno != errno.ELOOP:
             raise
-        what = "it is a link, and nothing is written through one: put the file itself there"
+        what = "it is a link, and flowrep doesn't write through links: replace it by the file"
         raise OSError(errno.ELOOP, what, path) from None
 
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Makes OSErrors name this file: that of a full disk names none, others a partial one."""
+    """Makes OSErrors name this file (that of a full disk names none) and what to do about it."""
     try:
         yield
     except OSError as error:
         if error.errno is None:
             raise
-        raise OSError(error.errno, error.strerror, str(path)) from error
+        problem = error.strerror
+        if error.errno in _REFUSED:  # anew, as another `naming` inside may have added the remedy
+            problem = f"{os.strerror(error.errno)}; free some space or make the folder writable"
+        raise OSError(error.errno, problem, str(path)) from error
 
 
 def set_aside(path: Path, problem: object) -> None:

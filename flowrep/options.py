@@ -206,7 +206,7 @@ class ForeignTransform(Options):
     target: str = Field(alias="_target_", pattern=CLASS)
 
 
-class Representations(Options):
+class RepresentationOptions(Options):
     """The options of each representation, by name; another name is a `ForeignTransform`."""
 
     model_config = ConfigDict(extra="allow")
@@ -221,13 +221,13 @@ class Representations(Options):
     depth2: StackedDepthOptions | None = None
 
 
-class ExactFlow(Options):
+class ExactFlowOptions(Options):
     """`flow=exact`."""
 
     source: Literal["exact"] = "exact"
 
 
-class EstimatedFlow(Options):
+class EstimatedFlowOptions(Options):
     """`flow=estimated`: options of `flowrep.transforms.EstimatedFlow`."""
 
     source: Literal["estimated"]
@@ -238,7 +238,7 @@ class EstimatedFlow(Options):
     picture_scale: Count = 1
 
     @model_validator(mode="after")
-    def _has_the_weights_it_needs(self) -> EstimatedFlow:
+    def _has_the_weights_it_needs(self) -> EstimatedFlowOptions:
         if self.estimator != "dis" and self.weights is None:
             raise ValueError(f"estimator={self.estimator} needs weights=, a file")
         if self.estimator == "dis" and self.weights is not None:
@@ -246,7 +246,7 @@ class EstimatedFlow(Options):
         return self
 
 
-class Noise(Options):
+class NoiseOptions(Options):
     """Errors of the depth camera and of odometry: options of `flowrep.transforms.SensorNoise`."""
 
     depth_sigma_per_m: NotNegative = 0.0

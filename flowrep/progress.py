@@ -30,7 +30,7 @@ def progress_bar(iterable: Any = None, *, what: str, **options: Any) -> Any:
     from tqdm.auto import tqdm
 
     # tqdm's default lock is one between processes, for which multiprocessing starts its resource
-    # tracker, and a hang-up would make that print a traceback
+    # tracker, and a hang-up would make that print a traceback.
     tqdm.set_lock(_LOCK)
     is_notebook = tqdm is not tqdm_asyncio
     if sys.stderr.isatty() or is_notebook:
@@ -50,7 +50,7 @@ class _Lines(io.TextIOBase):
 
     def write(self, text: str) -> int:
         line, now = text.strip("\r\n "), time.monotonic()
-        # a bar that is below another one moves the cursor first
+        # A bar that is below another one moves the cursor first.
         if line and not line.startswith("\x1b") and now - self._written_at >= LINE_EVERY_S:
             self._written_at = now
             sys.stderr.write(f"{line}\n")

@@ -273,7 +273,7 @@ class BulletCamera:
         is_sky = ids == -1
         depth = depth_from_zbuffer(zbuffer, *self._range_m)
         depth[is_sky] = np.inf
-        # ids are body + ((link + 1) << 24); the sky's -1 would be body 0xffffff, link 254
+        # Ids are body + ((link + 1) << 24); the sky's -1 would be body 0xffffff, link 254.
         packed = np.where(is_sky, 0, ids).view(np.uint32)
         body, link = packed & 0xFFFFFF, packed >> 24
         rows = self._table(int(body.max()), int(link.max()))

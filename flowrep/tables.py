@@ -85,7 +85,7 @@ def append_rows(
     if is_new:
         writer.writeheader()
     writer.writerows(rows)
-    # in one call, so that a process that is killed leaves all rows or none
+    # In one call, so that a process that is killed leaves all rows or none.
     with naming(path), open_to_append(path) as raw:
         data = text.getvalue().encode("utf-8")
         written = raw.write(data)

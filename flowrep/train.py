@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from flowrep.experiment.run import RunFolder
     from flowrep.experiment.runner import Runner
 
-PATIENCE_S = 60.0  # a process that was told to stop may still be saving the run
+PATIENCE_S = 60.0  # a process that received a stop signal may still be saving the run
 
 
 class EarlyCheck(Callback):
@@ -142,10 +142,9 @@ def finish(config: TrainConfig, folder: RunFolder, typed: Iterable[str] = ()) ->
         try:
             is_evaluated = complete(runner, stop)
         except (CheckpointError, DivergenceError, WorkerError, OSError) as error:
-            free = ". Free some space or make the folder writable" * isinstance(error, OSError)
             may_go_on = not isinstance(error, DivergenceError)
             exit_with(
-                f"after {runner.frames} frames: {error}{free}",
+                f"after {runner.frames} frames: {error}",
                 f"Continue with: {how_to_go_on}" if may_go_on else "",
             )
     if stop and not is_evaluated:

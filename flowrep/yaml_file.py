@@ -14,7 +14,7 @@ _OURS = Path(__file__).resolve().parent / "conf"
 # on Windows.
 CONF_DIR = (_OURS if _OURS.is_dir() else _OURS.parents[1] / "conf").resolve()
 MAX_NODES = 100_000
-"""Values of a file in which aliases are written out: each scene of flowrep's has some thousand."""
+"""Most values of a file with its aliases expanded; flowrep's scenes have fewer than 1,000."""
 
 
 class UsageError(ValueError):
@@ -22,7 +22,7 @@ class UsageError(ValueError):
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader, which takes the last of two equal keys, but refuses them instead.
+    """PyYAML's safe loader, except that a repeated key is an error; PyYAML takes the last one.
 
     It also refuses aliases that repeat each other: ten lines of ten aliases are 10¹⁰ values as soon
     as somebody copies what was read, and an alias within its own anchor is endless.
@@ -78,7 +78,7 @@ def read_yaml(path: str | Path) -> Any:
         raise UsageError(f"{path}{line}: {what}") from error
     except RecursionError as error:
         raise UsageError(f"{path}: is nested too deeply") from error
-    # the last two are PyYAML's at `!!bool x` and `!!timestamp x`
+    # The last two are PyYAML's at `!!bool x` and `!!timestamp x`.
     except (OSError, ValueError, yaml.YAMLError, KeyError, AttributeError) as error:
         raise UsageError(f"{path}: can't be read: {' '.join(str(error).split())}") from error
 

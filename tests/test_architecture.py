@@ -18,9 +18,10 @@ FLOWREP_IMPORTS_ALLOWED = {
     "diagnosis": {"diagnosis", "geometry"},
     "agent": {"agent", "extras", "files", "options"},
     "files": set(),
-    "scenes": {"scenes", "yaml_file", "extras"},
-    "simulator": {"simulator", "scenes", "extras"},
-    "envs": {"envs", "simulator", "scenes", "transforms", "geometry", "extras"} | {"progress"},
+    "scenes": {"scenes", "yaml_file", "extras", "choices"},
+    "simulator": {"simulator", "scenes", "extras", "choices"},
+    "envs": {"envs", "simulator", "scenes", "transforms", "geometry", "extras"}
+    | {"progress", "choices"},
     "pybullet": {"simulator", "extras"},
     "baselines": {"baselines", "envs", "scenes"},
     "experiment": {"experiment", "baselines", "envs", "simulator", "scenes", "agent"}
@@ -31,11 +32,12 @@ FLOWREP_IMPORTS_ALLOWED = {
     "viz": {"viz", "scenes", "geometry", "files"},
     "sequences": {"sequences", "config", "progress", "tables", "extras"}
     | {"transforms", "geometry", "viz", "diagnosis"},
-    "config": {"config", "options", "scenes", "yaml_file"},
+    "config": {"config", "choices", "options", "scenes", "yaml_file"},
+    "choices": set(),
     "options": set(),
     "yaml_file": set(),
     "report": {"report", "viz", "config", "experiment", "agent", "envs", "scenes"}
-    | {"extras", "tables", "files"},
+    | {"extras", "tables", "files", "choices"},
 }
 THIRD_PARTY_ONLY_IN = {
     "pybullet": {"simulator/bullet.py", "pybullet.py"},

@@ -11,7 +11,7 @@ import torch
 
 from flowrep.config import CONF_DIR, UsageError, config_groups, group_choices
 from flowrep.config.schema import TrainConfig, validated
-from flowrep.options import Noise, Representations
+from flowrep.options import NoiseOptions, RepresentationOptions
 from tests.config.composing import composed, plain
 
 pytest.importorskip("pybullet", reason="composed configs are built into environments")
@@ -131,7 +131,7 @@ def test_a_representation_spells_out_its_options_with_the_transforms_defaults(na
 
     given = plain("train", f"representations=[{name}]")["representations"][name]
     assert given == representation_options(name)
-    options = get_args(Representations.model_fields[name].annotation)[0]
+    options = get_args(RepresentationOptions.model_fields[name].annotation)[0]
     assert given.keys() == options.model_fields.keys()
 
 
@@ -151,9 +151,9 @@ OUT_OF_RANGE = {
 DECLARED = [
     *((f"representations.{name}", option)
       for name in group_choices("representations")
-      for option in get_args(Representations.model_fields[name].annotation)[0].model_fields),
+      for option in get_args(RepresentationOptions.model_fields[name].annotation)[0].model_fields),
     *(("flow", option) for option in ("preset", "min_side_px", "picture_scale")),
-    *(("noise", option) for option in Noise.model_fields),
+    *(("noise", option) for option in NoiseOptions.model_fields),
 ]  # fmt: skip
 
 

@@ -22,7 +22,7 @@ import imageio.v3 as imageio
 
 from flowrep.config import CONF_DIR, UsageError, group_choices
 from flowrep.config.schema import FactorizeConfig, validated
-from flowrep.factorize import factorize_recording, main
+from flowrep.factorize import factorize_recording, main, open_stream
 from flowrep.sequences import Frame, SequenceError, open_recording, read_flow, recorded_motion
 from flowrep.sequences.declared import declaration
 from flowrep.sequences.job import Job
@@ -326,8 +326,8 @@ def test_a_format_gives_options_of_its_reader_and_the_plain_layout_all(name):
     composed = settings(*given).format.options()
     assert composed == {k: 1 if k in needed else v for k, v in keys.items() if k != "_target_"}
     for key in needed:
-        with pytest.raises(UsageError, match=rf"format\.{key}=\.\.\."):
-            settings(*(text for text in given if not text.startswith(f"format.{key}")))
+        with pytest.raises(ValueError, match=rf"format\.{key}=\.\.\."):
+            open_stream(settings(*(text for text in given if not text.startswith(f"format.{key}"))))
 
 
 def test_the_command_ends_with_one_line_and_code_2(tmp_path, monkeypatch, capsys):

@@ -25,6 +25,20 @@ def fails(*_):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
+@pytest.mark.parametrize(
+    ("number", "has_remedy"), [(errno.ENOSPC, True), (errno.EACCES, True), (errno.ENOENT, False)]
+)
+def test_the_remedy_is_named_once_where_there_is_one(folder, number, has_remedy):
+    with (
+        pytest.raises(OSError, match=r"outer") as caught,
+        files.naming(folder / "outer"),
+        files.naming(folder / "inner"),
+    ):
+        raise OSError(number, os.strerror(number))
+    assert caught.value.errno == number
+    assert str(caught.value).count("free some space") == has_remedy
+
+
 def test_a_replaced_file_is_like_any_new_one(folder):
     path = folder / "a.txt"
     path.write_text("old")

@@ -235,7 +235,7 @@ class Algorithm(ABC):
         """Restores a `state_dict`, also into an agent that has learnt more since then or diverged.
 
         Raises:
-            ValueError: if another algorithm saved it, or it is for other maps or sizes.
+            ValueError: another algorithm saved it, or it is for other maps or sizes.
         """
         saved = state["weights"]
         here, there = ({n: tuple(w.shape) for n, w in x.items()} for x in (self.weights, saved))

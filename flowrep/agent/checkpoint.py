@@ -46,8 +46,8 @@ def save_checkpoint(path: str | os.PathLike[str], state: Mapping[str, Any]) -> N
             any depth. Tuples come back as lists.
 
     Raises:
-        TypeError: if `state` holds anything else; the message names the key.
-        CheckpointError: if it can't be written (disk full, read-only). A previous file is kept.
+        TypeError: `state` holds anything else; the message names the key.
+        CheckpointError: it can't be written (disk full, read-only). A previous file is kept.
     """
     path = Path(path)
     tensors: dict[str, Tensor] = {}
@@ -60,10 +60,7 @@ def save_checkpoint(path: str | os.PathLike[str], state: Mapping[str, Any]) -> N
         replace_file(path, partial(_write, tensors, metadata))
     except OSError as error:
         kept = "; the previous checkpoint is untouched" if path.exists() else ""
-        raise CheckpointError(
-            f"cannot write the checkpoint: {error}{kept}. Free some space or make the folder "
-            "writable"
-        ) from error
+        raise CheckpointError(f"cannot write the checkpoint: {error}{kept}") from error
 
 
 def _write(tensors: dict[str, Tensor], metadata: dict[str, str], path: Path) -> None:
@@ -83,7 +80,7 @@ def load_checkpoint(
     With `parts`, only these keys of the outermost dict are read.
 
     Raises:
-        CheckpointError: if the file is missing, damaged or not a checkpoint of this version.
+        CheckpointError: the file is missing, damaged or not a checkpoint of this version.
     """
     path = Path(path)
     if not path.is_file():

@@ -104,7 +104,7 @@ class DoubleDQN(OffPolicy):
         stochastic = super().make_policy(observation_spec, action_spec, keys, options, **run)
         actions = DiscreteActions.from_spec(action_spec)
         exploration = EGreedyModule(
-            # without the batch of envs, so that any batch may act
+            # Without the batch of envs, so that any batch may act.
             type(action_spec)(actions.count, dtype=action_spec.dtype, device=device),
             options.initial_epsilon,
             options.final_epsilon,

@@ -24,6 +24,8 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Categorical, Composite, TensorSpec
 
+from flowrep.agent.cpu import torch_threads
+
 PRECISIONS = ("auto", "bf16", "fp32")
 MIN_SIZE = 36  # convolutions of 8/4, 4/2 and 3/1 reduce 36 pixels to one
 _FLOAT16_MAX = torch.finfo(torch.float16).max
@@ -62,15 +64,13 @@ def has_bf16(device: torch.device) -> bool:
 @cache
 def _bf16_products_are_faster() -> bool:
     # Measured, because AVX-512's dot product of bfloat16 has 2 times the rate of float32 on some
-    # processors and 0.6 times on others. On one thread and in turns, the least of twenty times
-    # doesn't depend on other work on the machine.
+    # processors and 0.6 times on others. Both types are timed in turns and on one thread: the
+    # shortest of twenty times hardly depends on what else the machine does.
     least = {torch.bfloat16: math.inf, torch.float32: math.inf}
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    for dtype in [*least] * 20:
-        x, weight = torch.ones(128, 1024, dtype=dtype), torch.ones(512, 1024, dtype=dtype)
-        least[dtype] = min(least[dtype], timeit.timeit(partial(F.linear, x, weight), number=1))
-    torch.set_num_threads(threads)
+    with torch_threads(1):
+        for dtype in [*least] * 20:
+            x, weight = torch.ones(128, 1024, dtype=dtype), torch.ones(512, 1024, dtype=dtype)
+            least[dtype] = min(least[dtype], timeit.timeit(partial(F.linear, x, weight), number=1))
     return least[torch.bfloat16] < least[torch.float32]
 
 

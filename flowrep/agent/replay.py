@@ -32,6 +32,8 @@ class ReplayMemory(TensorDictReplayBuffer):
     Args:
         codecs: the maps to store; see `flowrep.agent.observation`.
         capacity: number of rows; beyond it, the oldest row is overwritten.
+        batch_size: number of transitions in a sample.
+        device: where rows are stored.
         n_steps: see `SuccessorSampler`, as for `gamma`.
     """
 

@@ -9,7 +9,7 @@ from torchrl.envs import TransformedEnv
 
 from flowrep.baselines.planner import Planner
 from flowrep.envs import StreetEnv, street_envs
-from flowrep.scenes.vehicle import NO_OP
+from flowrep.scenes.vehicle import NO_OP, YAW_SIGN
 
 __all__ = ["BASELINES", "Baseline", "BaselinePolicy", "Planner", "RandomActions", "never_turn"]
 
@@ -31,9 +31,9 @@ class RandomActions:
     def __call__(self, env: StreetEnv) -> int:
         """Returns one of the three actions."""
         if not env.episode.steps:
-            # The 0 is a seed of no meaning now: without it, stored evaluations had other draws.
+            # The 0 means nothing now, but without it stored evaluations would have other draws.
             self._rng = np.random.default_rng((env.episode.seed, 0))
-        return int(self._rng.integers(3))
+        return int(self._rng.integers(len(YAW_SIGN)))
 
 
 BASELINES: dict[str, Callable[[], Baseline]] = {

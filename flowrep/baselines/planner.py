@@ -25,7 +25,7 @@ from flowrep.scenes.scene import Path
 from flowrep.scenes.vehicle import NO_OP, YAW_SIGN, VehicleState, footprint_corners, roll, turn
 
 Array = NDArray[Any]
-_ACTIONS = np.array([0, 1, 2])
+_ACTIONS = np.arange(len(YAW_SIGN))
 _HOLD_STEPS = 2  # each decision of the search holds for two steps, which halves the search's depth
 _MARGIN_M = 0.1  # distance kept from the road's edge, and from people whose speed is known
 # Size of a cell of states: x, y in metres, yaw in degrees, yaw rate in degrees a second. Only the

@@ -131,8 +131,8 @@ def end_with(error: Exception, schema: type[Command]) -> NoReturn:
     if choice := _UNKNOWN_CHOICE.match(str(error)):
         group, name = choice.groups()
         text += (
-            f". A choice of your own is a file {group}/{name.removesuffix('.yaml')}.yaml in a "
-            "folder that --config-dir names"
+            f". To add a choice, create {group}/{name.removesuffix('.yaml')}.yaml in a folder and "
+            "name that folder with --config-dir"
         )
     exit_with(text)
 
@@ -184,8 +184,8 @@ def _check_no_file_is_hidden(job: Any) -> None:
             file, ours = folder / path, CONF_DIR / path
             are_there = file.is_file() and ours.is_file()
             if are_there and file.read_bytes() != ours.read_bytes():
-                remedy = "flowrep has a file of that name: rename it"
-                raise UsageError(f"{file} is not read, as {remedy}")
+                why = "because flowrep has a file of the same name: rename yours"
+                raise UsageError(f"{file} would be ignored, {why}")
 
 
 def plain_config(config: DictConfig) -> dict[str, Any]:
@@ -216,7 +216,8 @@ def explained(error: Exception, schema: type[Command]) -> str:
     text = str(error)
     if _is_out_of_memory(error):
         reason = text.partition("\n")[0] or "MemoryError"
-        return f"out of memory ({reason}): take fewer envs, a smaller camera, network or memory"
+        remedy = "use fewer envs, or a smaller camera, network or replay_capacity"
+        return f"out of memory ({reason}): {remedy}"
     if isinstance(error, FileExistsError | NotADirectoryError):
         return f"'{error.filename}' is a file, not a folder; give another with output="
     choice = _UNKNOWN_CHOICE.match(text)
@@ -375,7 +376,7 @@ def folder_name(text: str) -> str:
     ('s_turn', '_.._etc', '_')
     """
     name = "".join(c if c.isprintable() and c not in "/\\" else "_" for c in str(text))
-    # file systems allow 255 bytes
+    # File systems allow 255 bytes.
     return name.encode()[:200].decode(errors="ignore").lstrip(".") or "_"
 
 

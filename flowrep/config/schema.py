@@ -25,30 +25,28 @@ from pydantic import (
     model_validator,
 )
 
+from flowrep.choices import FRAME_RATES_HZ, BaselineName, Renderer, SpeedMode
 from flowrep.config import UsageError
 from flowrep.options import (
     ALGORITHMS,
     CLASS,
     AlgorithmOptions,
     Count,
-    EstimatedFlow,
-    ExactFlow,
-    Noise,
+    EstimatedFlowOptions,
+    ExactFlowOptions,
+    NoiseOptions,
     Options,
     Positive,
-    Representations,
+    RepresentationOptions,
     Text,
 )
 
 Model = TypeVar("Model", bound=BaseModel)
 
 CountOrZero = Annotated[int, Field(ge=0, le=2**53)]
-Seed = Annotated[int, Field(ge=0, lt=2**31)]  # larger ones are more than numpy takes
-SpeedMode = Literal["low", "normal", "high"]
-FrameRate = Annotated[float, Field(ge=0.5, le=1000)]
-BaselineName = Literal["planner", "speed_blind", "never_turn", "random"]
-Renderer = Literal["auto", "rasteriser", "pybullet"]
-MotionSource = Literal["exact", "estimated"]
+Seed = Annotated[int, Field(ge=0, lt=2**31)]  # every library's generator takes these
+FrameRate = Annotated[float, Field(ge=FRAME_RATES_HZ[0], le=FRAME_RATES_HZ[1])]
+MotionChoice = Literal["exact", "estimated"]
 Device = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
 Workers = CountOrZero | Literal["auto"]
 
@@ -102,7 +100,7 @@ def _in_their_order(value: Any, check: Any) -> dict[str, Any]:
     return {name: dict(options) for name, options in value.items()}
 
 
-Flow = Annotated[ExactFlow | EstimatedFlow, Field(discriminator="source")]
+FlowSection = Annotated[ExactFlowOptions | EstimatedFlowOptions, Field(discriminator="source")]
 
 
 class ForeignAlgorithm(AlgorithmOptions):
@@ -144,7 +142,7 @@ if TYPE_CHECKING:
 else:
     Scene = Annotated[Any, BeforeValidator(_scene), PlainSerializer(_scene_data)]
     Stack = Annotated[
-        Representations, WrapValidator(_in_their_order), PlainSerializer(lambda value: value)
+        RepresentationOptions, WrapValidator(_in_their_order), PlainSerializer(lambda value: value)
     ]
     Algorithm = Annotated[
         Union[
@@ -184,9 +182,9 @@ class EnvConfig(Command):
     num_workers: Workers
     renderer: Renderer
     representations: Stack
-    flow: Flow
-    motion: MotionSource
-    noise: Noise
+    flow: FlowSection
+    motion: MotionChoice
+    noise: NoiseOptions
     scene: Scene
 
     @model_validator(mode="after")
@@ -253,7 +251,7 @@ class TrainConfig(EnvConfig):
                 f"algorithm.{key}={value}: the first update would come after {frames} frames, "
                 f"and total_frames is {self.total_frames}: raise it, or lower algorithm.{key}"
             )
-        # a transition of all envs, and the step after it
+        # A transition of all envs, and the step after it.
         least = (1 + getattr(self.algorithm, "n_steps", 1)) * self.num_envs
         capacity = getattr(self.algorithm, "replay_capacity", least)
         if capacity < least:
@@ -271,9 +269,9 @@ class EvaluateConfig(Command):
     algorithm: Trusted
     scene: Scene | None = None
     representations: Stack | None = None
-    flow: Flow | None = None
-    motion: MotionSource | None = None
-    noise: Noise | None = None
+    flow: FlowSection | None = None
+    motion: MotionChoice | None = None
+    noise: NoiseOptions | None = None
     speed: Annotated[SpeedModes, OneOrMore]
     fps: Annotated[FrameRates | None, OneOrMore]
     episodes: Count
@@ -316,7 +314,7 @@ class EvaluateConfig(Command):
             if key == "representations" and all(options.keys() == {"_target_"} for options in maps):
                 continue
             if not others and getattr(self, key) is not None:
-                raise ValueError(f"{key}= is for a policy of your own; a run has its own {key}")
+                raise ValueError(f"{key}= can't be combined with run=: a run has its own {key}")
         return self
 
 
@@ -367,13 +365,6 @@ class Reader(Options):
         """Returns the options by name, without the class."""
         return dict(self.model_extra or {})
 
-    @model_validator(mode="after")
-    def _has_what_it_needs(self) -> Reader:
-        # Not ???, which would not replace the value of the format that this one extends.
-        for key in [key for key, value in self.options().items() if value == "needed"]:
-            raise ValueError(f"{key} needs a value: format.{key}=...")
-        return self
-
 
 class FlowScale(Options):
     """Flow of full colour, pixels."""
@@ -389,7 +380,7 @@ class FactorizeConfig(Command):
     input: Text | int
     output: Text
     format: Reader
-    flow: Flow
+    flow: FlowSection
     poses: Literal["recorded", "estimated"] | None
     check: Literal["error", "warn"]
     start: CountOrZero

@@ -33,6 +33,7 @@ class Outcome(IntEnum):
         return self.name.lower()
 
 
+EPISODE_SEEDS = 1 << 62  # seeds are smaller; a space of all numbers of int64 can't be sampled
 NOTHING_HIT = 255  # value of `hit` without a collision; no class has this id
 
 
@@ -75,9 +76,11 @@ class Episode:
     """The constants and the state of one drive.
 
     Args:
+        layout: the ground plan of the scene.
         frame_rate_hz: steps a second.
         episode_seed: seed of everything that is drawn: the path, and how people walk.
         speed_mps: lowest and highest speed of people whose group doesn't set its speed.
+        vehicle_speed_mps: the speed at which the vehicle drives.
         path: the name of the path; None draws one.
 
     Raises:

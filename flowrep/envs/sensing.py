@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from flowrep.envs.episode import Episode, Moment
+from flowrep.envs.episode import EPISODE_SEEDS, Episode, Moment
 from flowrep.scenes.pedestrians import PARTS, world_from_parts
 from flowrep.scenes.scene import num_classes
 from flowrep.simulator import camera
@@ -108,7 +108,7 @@ class Sensing:
             "prev_from_curr": spaces.Box(-np.inf, np.inf, (4, 4), np.float32),
             "instance_motion": spaces.Box(-np.inf, np.inf, (1 + parts, 4, 4), np.float32),
             "rgb": spaces.Box(0, 255, (3, *(self._scale * side for side in size)), np.uint8),
-            "frame": spaces.Box(0, (1 << 31) - 1, (2,), np.int64),
+            "frame": spaces.Box(0, EPISODE_SEEDS - 1, (2,), np.int64),
         }
         return spaces.Dict({name: every[name] for name in self.names})
 

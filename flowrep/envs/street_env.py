@@ -8,10 +8,11 @@ from typing import Any
 import gymnasium as gym
 from gymnasium import spaces
 
-from flowrep.envs.episode import Episode, Moment, Outcome, reward
+from flowrep.choices import FRAME_RATES_HZ, SpeedMode
+from flowrep.envs.episode import EPISODE_SEEDS, Episode, Moment, Outcome, reward
 from flowrep.envs.sensing import SENSORS, Sensing
 from flowrep.scenes.load import load_scene
-from flowrep.scenes.scene import FRAME_RATES_HZ, Range, Scene, SpeedMode, num_classes
+from flowrep.scenes.scene import Range, Scene, num_classes
 from flowrep.scenes.vehicle import YAW_SIGN, VehicleState
 from flowrep.simulator.street import Street
 
@@ -120,7 +121,7 @@ class StreetEnv(gym.Env):
             try:
                 self._resume(options["state"])
             except (KeyError, TypeError) as error:
-                raise ValueError(f"the state is none that get_state returned: {error!r}") from error
+                raise ValueError(f"this is not a state returned by get_state: {error!r}") from error
         else:
             self._begin({"episode_seed": int(self.np_random.integers(1 << 31))} | options)
 
@@ -181,9 +182,8 @@ class StreetEnv(gym.Env):
         if not 0 <= _number(vehicle_speed_mps) < math.inf:
             raise ValueError(f"vehicle_speed_mps is {vehicle_speed_mps!r}; give m/s, 0 for rest")
         episode_seed = options["episode_seed"]
-        # TensorDicts hold it as int64.
-        if not hasattr(episode_seed, "__index__") or not 0 <= episode_seed < 1 << 63:
-            raise ValueError(f"episode_seed is {episode_seed!r}; give an int, 0 to 2**63 - 1")
+        if not hasattr(episode_seed, "__index__") or not 0 <= episode_seed < EPISODE_SEEDS:
+            raise ValueError(f"episode_seed is {episode_seed!r}; give an int, 0 to 2**62 - 1")
         self._episode = Episode(
             self._street.layout,
             checked_frame_rate(self.scene, options.get("frame_rate_hz", self.frame_rate_hz)),

@@ -11,13 +11,14 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import Compose, GymWrapper, TransformedEnv
 
+from flowrep.choices import SpeedMode
 from flowrep.envs.sensing import SENSORS
 from flowrep.envs.street_env import StreetEnv, checked_frame_rate
 from flowrep.envs.vector_env import StreetVectorEnv
 from flowrep.envs.workers import WorkerVectorEnv, available_cores
 from flowrep.geometry.checks import checked_count
 from flowrep.scenes.load import load_scene
-from flowrep.scenes.scene import Range, Scene, SpeedMode, num_classes
+from flowrep.scenes.scene import Range, Scene, num_classes
 from flowrep.scenes.vehicle import YAW_SIGN
 from flowrep.simulator.camera import choose_renderer, sensor_intrinsics
 from flowrep.transforms import Mirror, representation_stack
@@ -45,7 +46,13 @@ def sensors_read(transforms: Iterable[Any]) -> list[str]:
 
 
 class VectorWrapper(GymWrapper):
-    """TorchRL's wrapper; reset masks are optional, and moved to the CPU."""
+    """TorchRL's wrapper; reset masks are optional, and moved to the CPU.
+
+    Args:
+        env: the vector env of the streets.
+        scene: the scene of all its envs, kept as an attribute, as is `frame_rate_hz`.
+        kwargs: see `torchrl.envs.GymWrapper`.
+    """
 
     def __init__(
         self,
@@ -130,9 +137,10 @@ def make_env(
     loaded = load_scene(scene)
     # An estimator and its pictures need one scale; that of a mapping counts.
     if flow == "estimated":
-        flow = {"source": flow, "picture_scale": picture_scale}
-    if isinstance(flow, Mapping):
-        picture_scale = flow.get("picture_scale", picture_scale)
+        flow = {"source": flow}
+    if isinstance(flow, Mapping) and flow.get("source") == "estimated":
+        flow = {"picture_scale": picture_scale, **flow}
+        picture_scale = flow["picture_scale"]
     drawn: Any = {"renderer": choose_renderer(renderer), "picture_scale": picture_scale}
     street = partial(StreetEnv, loaded, speed, frame_rate_hz, **drawn)
     frame_rate_hz = checked_frame_rate(loaded, frame_rate_hz)
@@ -194,7 +202,7 @@ def begin_step(env: TransformedEnv, acted: TensorDictBase) -> None:
 
 
 def has_spare_cores(env: TransformedEnv, threads: int) -> bool:
-    """Returns whether there is a core for each of the env's workers and `threads` own threads."""
+    """Returns whether there is a core for each worker of the env and each of `threads` threads."""
     # If not, running both at once takes longer than one after the other: threads synchronise at
     # every operation, and all of them wait when one loses its core.
     return _vector(env).num_workers + threads <= available_cores()

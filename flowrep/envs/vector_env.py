@@ -11,13 +11,13 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
-from flowrep.envs.episode import NOTHING_HIT, Episode, Outcome, reward
+from flowrep.envs.episode import EPISODE_SEEDS, NOTHING_HIT, Episode, Outcome, reward
 from flowrep.envs.workers import copy_into_rows
 
 _STATUS: dict[str, Any] = {
     "outcome": spaces.Box(0, len(Outcome) - 1, (1,), np.uint8),
     "hit": spaces.Box(0, NOTHING_HIT, (1,), np.uint8),
-    "episode_seed": spaces.Box(0, (1 << 31) - 1, (1,), np.int64),
+    "episode_seed": spaces.Box(0, EPISODE_SEEDS - 1, (1,), np.int64),
     "path": spaces.Box(0, 1 << 31, (1,), np.int64),
     "vehicle": spaces.Box(-np.inf, np.inf, (3,), np.float32),
 }

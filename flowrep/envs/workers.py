@@ -31,9 +31,11 @@ VectorFactory = Callable[[Sequence[EnvFactory]], SyncVectorEnv]
 _SIDE_BY_SIDE = partial(SyncVectorEnv, copy=False, autoreset_mode=AutoresetMode.DISABLED)
 
 
-PATIENCE_S, PATIENCE_AFTER_STOP_S = 300.0, 10.0
-"""How long a worker may take to answer. It starts in seconds and steps in milliseconds, but the
-machine may be busy. After a signal to stop there is less time: SIGKILL may follow soon."""
+PATIENCE_S = 300.0
+"""How long a worker may take to answer: it starts in seconds and steps in milliseconds, but the
+machine may be busy."""
+PATIENCE_AFTER_STOP_S = 10.0
+"""The same after a signal to stop, as SIGKILL may follow soon."""
 PATIENCE_AT_THE_END_S = 5.0
 """How long workers may take to end before they are killed."""
 

@@ -18,9 +18,9 @@ from flowrep.config.cli import composed
 from flowrep.config.schema import (
     EnvConfig,
     Episodes,
-    ExactFlow,
+    ExactFlowOptions,
     Machine,
-    Noise,
+    NoiseOptions,
     TrainConfig,
     check_policy,
     policy_kind,
@@ -109,7 +109,7 @@ class Agent(Driver):
         representations: Mapping[str, Any] | Sequence[str] | None = None,
         flow: Any = None,
         motion: str | None = None,
-        noise: Noise | None = None,
+        noise: NoiseOptions | None = None,
         trusted: Collection[str] = (),
         precision: str | None = None,
         device: str = "auto",
@@ -151,12 +151,12 @@ class Agent(Driver):
             names = {"representations": [*representations]}
             maps = composed(names)[0].representations
         if kind != "external":
-            # A `_target_` alone only trusts a class that a run names; `trusted` has it.
+            # `_target_` alone is no map: it trusts a class that a run names, as `trusted` says.
             chosen = [each for each in maps.values() if {*(each or {})} != {"_target_"}] or None
             given = {"representations": chosen, "flow": flow, "motion": motion, "noise": noise}
             for key, value in given.items():
                 if value is not None:
-                    raise UsageError(f"{key}= is for a policy of your own, not for policy={name}")
+                    raise UsageError(f"{key}= is for another project's policy, not for {name}")
         if kind in ("baseline", "external"):
             if precision is not None:
                 raise UsageError(f"precision= is for a trained agent, not for policy={name}")
@@ -241,9 +241,9 @@ def _config_without_run(
         "scene": scene or load_scene("straight_road"),
         # Replaced below: the schema would refuse maps whose options have defaults.
         "representations": {"rgb": {}},
-        "flow": ExactFlow(),
+        "flow": ExactFlowOptions(),
         "motion": "exact",
-        "noise": Noise(),
+        "noise": NoiseOptions(),
         "speed": "normal",
         "renderer": "auto",
         "seed": 0,

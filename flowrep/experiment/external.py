@@ -65,7 +65,7 @@ class ExternalPolicy:
 
     def __call__(self, maps: TensorDictBase) -> TensorDictBase:
         """Returns the maps with `action`."""
-        # a copy, since the env reads the maps again if the policy changes them
+        # A copy, since the env reads the maps again if the policy changes them.
         seen = maps.select(*self._task.representations, "env_id", "is_init").clone()
         with _named(self.name):
             given = self._act(seen)

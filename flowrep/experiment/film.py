@@ -23,7 +23,7 @@ from flowrep.experiment.evaluation import Driver, evaluate
 from flowrep.experiment.outcomes import EpisodeRecord
 from flowrep.scenes.vehicle import YAW_SIGN
 from flowrep.transforms import representation_stack
-from flowrep.transforms.stack import FLOWS, REPRESENTATIONS, representation_options
+from flowrep.transforms.stack import FLOWS, FRAMES_OF, REPRESENTATIONS, representation_options
 from flowrep.viz import (
     Image,
     Tile,
@@ -211,7 +211,7 @@ class Film:
         height, width = self._tile_size
         if spec.shape[-2] * width != spec.shape[-1] * height:
             return  # it doesn't fit a strip of the camera's pictures
-        if frames_of := {"seg2": "seg", "depth2": "depth"}.get(name):
+        if frames_of := FRAMES_OF.get(name):
             tile, count = self.tiles[frames_of], int(self._options(name)["k"])
             tile = tile._replace(about=f"{tile.about} The last {count} frames, oldest first.")
         else:

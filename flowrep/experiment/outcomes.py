@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from flowrep.config.schema import TrainConfig
 
 OUTCOMES = ("success", "collision", "out_of_bounds", "timeout")
-"""How an episode can end. Repeated here, since `flowrep.envs`, which defines it, needs PyTorch."""
+"""How an episode can end. Repeated here, as `flowrep.envs`, which defines it, needs PyBullet."""
 
 CAUSES = ("out of bounds", "collision: pedestrian", "collision: other", "timeout")
 _FAILURE_GROUP = (
@@ -111,11 +111,11 @@ def _final_rows(folder: Path) -> list[dict[str, str]]:
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     """Returns Wilson's 95 % score interval of a proportion; (0, 1) without trials."""
-    # not scipy's, which a training needn't have installed
+    # Not scipy's, which a training needn't have installed.
     if not trials:
         return 0.0, 1.0
-    # the proportions p from which the observed share is at most z standard errors away: the
-    # solutions of (share - p)² = z² p (1 - p) / trials
+    # The proportions p from which the observed share is at most z standard errors away: the
+    # solutions of (share - p)² = z² p (1 - p) / trials.
     z2 = NormalDist().inv_cdf(0.975) ** 2
     share = successes / trials
     centre = (share + z2 / (2 * trials)) / (1 + z2 / trials)
@@ -188,7 +188,7 @@ def print_table(title: str, rows: Sequence[Mapping[str, Any]], least_width: int 
     for name in rows[0]:
         heading = name.replace("_", " ").replace(": ", ":\n")
         is_number = all(str(row[name])[:1] in "-+−<0123456789" for row in rows)
-        # a policy's name may be a long path: it is folded, numbers are not
+        # A policy's name may be a long path: it is folded, numbers are not.
         table.add_column(
             heading,
             no_wrap=name != "policy",
@@ -197,6 +197,6 @@ def print_table(title: str, rows: Sequence[Mapping[str, Any]], least_width: int 
         )
     for row in rows:
         table.add_row(*map(str, row.values()))
-    # names are text: a[b] is no markup, :car: no emoji
+    # Names are text: a[b] is no markup, :car: no emoji.
     console = Console(width=max(least_width, Console().width), markup=False, emoji=False)
     console.print(table)

@@ -49,7 +49,7 @@ _IDENTITY = (
 def origin_of(config: Mapping[str, Any]) -> dict[str, Any]:
     """Returns the identity of a run: flowrep's version, and the config keys that define it."""
     parts = json.loads(json.dumps({key: config[key] for key in _IDENTITY}))
-    # It is only for presets that choose `algorithm.mirror`; no street depends on it.
+    # It only selects `algorithm.mirror` in presets; the street is the same with and without it.
     parts["scene"].pop("symmetric", None)
     return {"flowrep": __version__, **parts}
 

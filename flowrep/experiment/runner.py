@@ -180,7 +180,7 @@ class Runner:
 
     def plot_and_film(self) -> None:
         """Writes causes of failure and the learning curve; films an episode if none is filmed."""
-        # drawing takes seconds to import
+        # Drawing takes seconds to import.
         from flowrep.experiment.film import record_episode
         from flowrep.experiment.learning_curve import draw_learning_curve
         from flowrep.viz import is_playable

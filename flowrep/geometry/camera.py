@@ -103,7 +103,6 @@ def intrinsics_from_fov(
     height: int,
     width: int,
     pixel_aspect: float = 1.0,
-    dtype: torch.dtype = torch.float32,
 ) -> Tensor:
     """Returns K `[3, 3]` of a camera with a centred principal point.
 
@@ -117,7 +116,6 @@ def intrinsics_from_fov(
         height: of the picture, pixels.
         width: of the picture, pixels.
         pixel_aspect: a pixel's width over its height, fy / fx; 1 for square pixels.
-        dtype: of K.
 
     >>> intrinsics_from_fov(90.0, axis="vertical", height=4, width=6)
     tensor([[2., 0., 3.],
@@ -136,7 +134,7 @@ def intrinsics_from_fov(
     if axis == "vertical":
         fx, fy = focal / pixel_aspect, focal
     rows = [[fx, 0.0, width / 2], [0.0, fy, height / 2], [0.0, 0.0, 1.0]]
-    return torch.tensor(rows, dtype=torch.float64).to(dtype)
+    return torch.tensor(rows, dtype=torch.float32)
 
 
 def intrinsics_from_opencv(K_opencv: Tensor) -> Tensor:

@@ -150,7 +150,10 @@ def check_depth_options(
     """Raises ValueError if an argument that `kind` needs is missing, or an unused one is given."""
     check_name("kind", kind, DepthKind)
     if has_camera != (kind == "ray_length"):
-        raise ValueError(f"'ray_length' needs K, the other kinds do not read it; kind is {kind!r}")
+        raise ValueError(
+            "'ray_length' needs K (AdaptDepth: intrinsics=), the other kinds do not read it; kind "
+            f"is {kind!r}"
+        )
     is_buffer = kind.endswith("z_buffer")
     planes = (near_m is not None) + (far_m is not None)
     if planes != (2 if is_buffer else 0):

@@ -50,16 +50,18 @@ _HYPOTHESIS_STEPS, _STEPS = 3, 4  # Gauss-Newton steps of a hypothesis, and of t
 _random = random.Random(0)
 _DRAWS = [[_random.random() for _ in range(PIXELS_EACH)] for _ in range(HYPOTHESES)]
 
-# The residual at which a pixel's cost is half of its bound: 1.5 standard deviations, but at least
-# 0.02 px. The residuals of exact flow are only rounding errors, which can't rank motions.
-_SCORE_SCALES, _LEAST_SCORE_PX = 1.5, 0.02
+# The residual at which a pixel's cost is half of its bound. The least is for exact flow, whose
+# residuals are only rounding errors, which can't rank motions.
+_SCORE_SCALES = 1.5  # in standard deviations
+_LEAST_SCORE_PX = 0.02
 _PRIORS_FAVOUR = 1.5  # the prior wins against a body on up to 3/5 of the pixels, 1.5 times the rest
-_REFINED, _REFINING_STEPS = 6, 2  # how many of the best hypotheses are refined, in how many steps
+_REFINED = 6  # how many of the best hypotheses are refined
+_REFINING_STEPS = 2  # Gauss-Newton steps of each of them
 _RIVAL_STEPS = 3  # Gauss-Newton steps of the second candidate
 _INLIER_SCALES = 2.5  # in standard deviations; 96 % of normal errors in two channels are within
 _STILL_PX = 0.2  # flow with residuals up to this standard deviation may be that of a still camera
 _LEAST_STRENGTH = 0.1  # least mean square of a motion's flow, relative to that of the residuals
-_CHANCES = 16  # a motion must be this many times as strong as one fitted to noise, 3 / N
+_CHANCES = 16  # least strength of a motion, relative to that of one fitted to noise, 3 / N
 _LEAST_SCALE_PX = 2e-3  # far above the rounding of exact float32 flow, far below any measured flow
 _SCALES = 1.5  # standard deviations at which the weight of a pixel is a quarter
 _QUANTILE = 1 / 3  # of residuals, which gives their scale; half of the pixels may be outliers
@@ -140,9 +142,9 @@ def camera_motion(
     across the edge counts.
 
     `valid` is False, and the motion is the prior, if fewer than 32 pixels are known, if they don't
-    determine all directions (sky alone, for instance, determines only rotation), or if flow is
-    noise: no motion fits it to 0.2 px, or better than chance allows. If a K or the prior isn't
-    finite, the motion is the identity.
+    determine all directions (sky alone, for instance, determines only rotation), if flow is noise
+    (no motion fits it to 0.2 px, or better than chance allows), or if a K is invalid (see
+    `ego_flow`). If the prior isn't finite, `valid` is False and the motion is the identity.
 
     Two failures don't show in the result. If more than half of the known pixels move as one body,
     the motion is relative to that body; a prior helps. And the covariance assumes independent

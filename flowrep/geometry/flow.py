@@ -60,8 +60,8 @@ def ego_flow(
 
     Flow is 0 and invalid where depth is nan or <= 0, and where the point's depth in the previous
     camera was negative or less than a hundredth of its current depth (there, flow grows without
-    bound). A whole frame is invalid if its K, its motion or its `dt` isn't finite or has an entry
-    beyond 1e8, or if `dt` isn't positive. Valid flow is finite.
+    bound). A whole frame is invalid if its K or its motion isn't finite or has an entry beyond 1e8,
+    if a focal length is 0, or if its `dt` isn't finite or is below 1e-8. Valid flow is finite.
 
     Equations 7 to 11 of the paper. Floats narrower than float32 are computed in float32.
 

@@ -182,7 +182,7 @@ def _panels(
         longest = max(len(handle.get_label()) for handle in handles)
         entry_in = (0.5 * longest + 3.5) * em_in  # half an em a letter, 3.5 for the sign and gaps
         beside = min(len(handles), max(1, int(width / entry_in)))
-        # matplotlib fills a legend column by column, but people read row by row
+        # Matplotlib fills a legend column by column, but people read row by row.
         by_column = [handle for start in range(beside) for handle in handles[start::beside]]
         gaps = {"handlelength": 1.8, "columnspacing": 1.2, "handletextpad": 0.5}
         figure.legend(handles=by_column, loc="outside upper center", ncols=beside, **gaps)
@@ -228,7 +228,7 @@ def _rate_lines(axes: Axes, grid: SuccessGrid) -> None:
     at = [condition.fps for condition in grid.conditions]
     step = min((b - a for a, b in pairwise(at)), default=1.0)
     for index, (name, look) in enumerate(looks(grid.series).items()):
-        # side by side, so that whiskers of equal scores are all visible
+        # Side by side, so that whiskers of equal scores are all visible.
         aside = (index - (len(grid.series) - 1) / 2) * 0.08 * step
         driven = [c for c in grid.conditions if (name, c) in grid.cells]
         if driven:

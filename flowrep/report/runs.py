@@ -5,11 +5,12 @@ from dataclasses import dataclass, field
 from functools import cached_property, reduce
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrep.choices import SpeedMode
 from flowrep.experiment.run import flattened, origin_of
 from flowrep.report.statistics import Array, Estimate, mean_share
 
@@ -18,7 +19,7 @@ Columns = dict[str, NDArray[Any]]
 Score = Callable[[Sequence[NDArray[Any]]], float]
 """Returns a run's score from the outcomes of its episodes under each condition."""
 
-SPEEDS = ("low", "normal", "high")  # speed modes of the pedestrians
+SPEEDS: tuple[str, ...] = get_args(SpeedMode)
 # The paper's scenes and stacks, in the order of its figures.
 SCENES = ("straight_road", "s_turn", "h_shaped_pathways", "three_way_junction")
 FLOW_STACKS = ("ego", "raw", "obj", "ego+obj")
@@ -26,7 +27,7 @@ COMPLEMENTARY_STACKS = (
     "seg2", "depth2", "ego+obj", "ego+obj+seg2", "ego+obj+depth2", "ego+obj+seg2+depth2",
 )  # fmt: skip
 STACKS = tuple(dict.fromkeys(FLOW_STACKS + COMPLEMENTARY_STACKS))
-BASELINES = ("never_turn", "random", "planner", "speed_blind")
+DRAWN_BASELINES = ("never_turn", "random", "planner", "speed_blind")
 _REPRESENTATIONS = ("raw", "ego", "obj", "seg", "seg2", "depth", "depth2", "rgb")
 _OF_EVERY_SCENE = ("camera", "frame_rate_hz")  # keys whose values are the same in all scenes
 
@@ -278,7 +279,7 @@ def grid_of(
     scene: str,
     series: Mapping[str, Sequence[Run]],
     conditions: Sequence[Condition],
-    baselines: Sequence[str] = BASELINES,
+    baselines: Sequence[str] = DRAWN_BASELINES,
 ) -> SuccessGrid:
     """Returns the success of several series of runs in a scene, without runs of other scenes."""
     here = {name: [run for run in runs if run.scene == scene] for name, runs in series.items()}

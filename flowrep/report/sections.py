@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from flowrep.config.cli import line_for
 from flowrep.report.figures import draw_bars, draw_curves, draw_rates, encoded, words
 from flowrep.report.runs import (
-    BASELINES,
     COMPLEMENTARY_STACKS,
+    DRAWN_BASELINES,
     FLOW_STACKS,
     SPEEDS,
     STACKS,
@@ -163,7 +163,7 @@ def _success_section(
     series: Mapping[str, Sequence[Run]],
     pairs: Sequence[tuple[str, str]],
     policy: str,
-    baselines: Sequence[str] = BASELINES,
+    baselines: Sequence[str] = DRAWN_BASELINES,
 ) -> ReportSection:
     runs = [run for members in series.values() for run in members]
     conditions, scenes = _at_speeds(runs, policy), scenes_of(runs)

@@ -12,6 +12,7 @@ import csv
 import gzip
 import io
 import json
+import math
 import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -203,7 +204,7 @@ def _packed(names: Sequence[str], tables: Mapping[str, Columns]) -> bytes:
 
 def _text(value: Any) -> str:
     if isinstance(value, float):  # five digits are enough for a loss
-        return "" if value != value else f"{value:.5g}" if abs(value) < 1e5 else f"{value:.0f}"
+        return "" if math.isnan(value) else f"{value:.5g}" if abs(value) < 1e5 else f"{value:.0f}"
     return str(value)
 
 

@@ -149,6 +149,7 @@ class Layout:
             reached = shapely.box(*self._paved.bounds).buffer(scene.terrain_m)
             self.terrain = reached.difference(self._paved)
         self.crosswalks = tuple(map(self._crosswalk_area, scene.crosswalks))
+        self.zone_of = {zone.name: zone for zone in scene.zones}
         self.zones = {z.name: self._road_between(z.road, z.from_m, z.to_m) for z in scene.zones}
         self.closures = {closure.name: self._closure_box(closure) for closure in scene.closures}
         self.buildings = self._buildings()
@@ -176,7 +177,7 @@ class Layout:
 
     def start_state(self, zone_name: str) -> VehicleState:
         """Returns the vehicle in the middle of a start zone, with zero yaw rate."""
-        zone = next(zone for zone in self.scene.zones if zone.name == zone_name)
+        zone = self.zone_of[zone_name]
         x, y, heading = self.pose_at(zone.road, (zone.from_m + zone.to_m) / 2)
         return VehicleState(x, y, heading + (math.pi if zone.reverse else 0.0), 0.0)
 

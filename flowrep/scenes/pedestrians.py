@@ -20,7 +20,8 @@ RADIUS_M, HEIGHT_M = 0.3, 1.75  # of the collision cylinder
 APART_M = 2 * RADIUS_M  # distance between the centres of two people who touch
 LANE_M = APART_M + 0.01  # least distance between lanes; with rounding, people still don't touch
 PARTS = ("upper body", "left leg", "right leg")
-HIP_M, _HIP_ASIDE_M = 0.82, 0.1  # height of the hips, and their distance from the middle
+HIP_M = 0.82  # height of the hips
+_HIP_ASIDE_M = 0.1  # their distance from the middle
 _SIDES = np.array([1.0, -1.0])  # of the legs: left is +y
 
 

@@ -11,9 +11,8 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import AfterValidator, ConfigDict, Field, Strict, StringConstraints
 
-FRAME_RATES_HZ = (0.5, 1_000.0)  # lowest and highest
+from flowrep.choices import FRAME_RATES_HZ, SpeedMode
 
-SpeedMode = Literal["low", "normal", "high"]
 Kind = Literal["house", "tree", "fence", "car", "traffic_light", "lamp_post"]
 Range = tuple[float, float]
 

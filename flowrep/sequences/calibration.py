@@ -18,7 +18,7 @@ from flowrep.sequences.files import regular
 from flowrep.sequences.recording import Pose, SequenceError
 
 Matrix: TypeAlias = NDArray[np.float64]
-Layout: TypeAlias = Literal["matrix", "xyz_xyzw", "xyz_wxyz", "xyzw_xyz"]
+StoredPoseLayout: TypeAlias = Literal["matrix", "xyz_xyzw", "xyz_wxyz", "xyzw_xyz"]
 Lens: TypeAlias = Literal["opencv", "fisheye"]
 
 MIRROR_REMEDY = (
@@ -105,7 +105,7 @@ def as_pose(
     numbers: NDArray[np.float64],
     source: object,
     *,
-    layout: Layout = "matrix",
+    layout: StoredPoseLayout = "matrix",
     direction: PoseDirection = "camera_to_world",
     axes: CameraAxes = "opencv",
 ) -> Pose:
@@ -154,9 +154,9 @@ class Undistortion:
     def __call__(self, image: Any, *, nearest: bool = False) -> Any:
         """Returns the rectified map; nan, or black, outside of the lens's picture."""
         border = np.nan if image.dtype.kind == "f" else 0.0
-        way = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
+        interpolation = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
         columns, rows = self._maps
-        return cv2.remap(image, columns, rows, way, borderValue=4 * [border])
+        return cv2.remap(image, columns, rows, interpolation, borderValue=4 * [border])
 
 
 _LARGEST_FOOTPRINT_PX = 8

@@ -69,7 +69,7 @@ class DeclaredRecording(Recording):
     pose_lag_frames: int
     leave_out: Sequence[str]
     backwards: bool
-    pose_layout: calibration.Layout
+    pose_layout: calibration.StoredPoseLayout
     pose_direction: geometry.PoseDirection
     pose_axes: geometry.CameraAxes
     marker_from_cam: Sequence[float] | None
@@ -93,19 +93,23 @@ class DeclaredRecording(Recording):
 
     def __post_init__(self) -> None:
         self.folder = Path(self.folder)
+        # Not ???, which would not replace the value of the format that this one extends.
         for key in [key for key, value in vars(self).items() if value == "needed"]:
-            raise ValueError(f"{key} needs a value")
+            raise ValueError(f"format.{key} needs a value: format.{key}=...")
         if self.depth_unit_m is not None and not self.depth_unit_m > 0:
-            raise ValueError(f"depth_unit_m is positive, got {self.depth_unit_m}")
+            raise ValueError(f"depth_unit_m must be positive, got {self.depth_unit_m}")
         self.has_flow, self.no_flow = self._flow_fits()
         depths, depth_times_s = self._listing(self.depth, "map")
-        times_s, listed, rgb, self._video = depth_times_s, depths, self._path(self.rgb or "x"), None
+        listed, times_s = depths, depth_times_s
+        self._video: VideoPictures | None = None
         self._rgbs: list[Path] | None = None
-        if rgb.suffix.lower() in VIDEOS:
-            self._video = VideoPictures(rgb)
-        elif self.rgb is not None and (rgb.parent.is_dir() or not self.has_flow):
-            listed, times_s = self._listing(self.rgb, "picture")
-            self._rgbs = [*listed.values()]
+        if self.rgb is not None:
+            rgb = self._path(self.rgb)
+            if rgb.suffix.lower() in VIDEOS:
+                self._video = VideoPictures(rgb)
+            elif rgb.parent.is_dir() or not self.has_flow:
+                listed, times_s = self._listing(self.rgb, "picture")
+                self._rgbs = [*listed.values()]
         self._names, self._times_s = [*listed], times_s
         left_out = self._match_depth(depths, depth_times_s)
         if self.times is not None and self._exists(self.times):
@@ -211,7 +215,7 @@ class DeclaredRecording(Recording):
         if unpaired := {*ours} ^ {*theirs}:
             lacks = self.rgb if min(unpaired) in theirs else self.depth
             raise SequenceError(
-                self._path(lacks or "").parent, f"lacks frame {min(unpaired)}'s file"
+                self._path(lacks or "").parent, f"has no file for frame {min(unpaired)}"
             )
         self._depths = [dict(zip(theirs, depths.values()))[key] for key in ours]
         return {}
@@ -249,8 +253,8 @@ class DeclaredRecording(Recording):
             keys = table[:, self.key_column]
             row_of = {key: row for row, key in enumerate(keys.tolist())}
             if len(row_of) < len(keys) or not np.isfinite(keys).all():
-                says = "has two rows for one frame, or a frame's number that is nan or inf"
-                raise SequenceError(path, f"{says}: choose rows with format.rows_where")
+                says = "has two rows with the same frame number, or one that is nan or inf"
+                raise SequenceError(path, f"{says}; select rows with format.rows_where")
             before = after = np.array([row_of.get(_number(name), -1) for name in self._names])
         elif len(table) != len(before):
             raise SequenceError(path, f"has {len(table)} rows for {len(before)} frames")
@@ -315,6 +319,8 @@ class DeclaredRecording(Recording):
         if len(shift) == 3:
             shift = np.column_stack([np.eye(3), shift]).ravel()
         self._colour_from_depth = as_pose(shift, "colour_from_depth")
+        if depth is None and np.any(self._colour_from_depth != np.eye(4)):
+            raise SequenceError("colour_from_depth", "needs format.depth_intrinsics, too")
         return {"without intrinsics": lacking}
 
     def _numbers_in(self, given: str | Sequence[float]) -> Floats:
@@ -413,13 +419,13 @@ class DeclaredRecording(Recording):
             depth[trust < self.min_confidence] = np.nan
         return depth
 
-    def _raw(self, pattern: str, name: str, other: str) -> files.Flow:
+    def _raw(self, pattern: str, name: str, other: str) -> files.FlowMap:
         stored = files.read_flow(self._file(pattern, "flow", name, next=other), self.flow_coding)
         # If it is read backwards, the next frame is the previous one.
         is_forward = (self.flow_direction == "forward") != (self.flow_to == "next")
         options: Any = {"grid": "current", "channels": self.flow_channels}
         options |= {"direction": "forward" if is_forward else "backward"}
-        raw: files.Flow = geometry.adapt_flow(torch.from_numpy(stored), **options).numpy()
+        raw: files.FlowMap = geometry.adapt_flow(torch.from_numpy(stored), **options).numpy()
         if self.flow_mask is not None:
             mask = self._file(self.flow_mask, "map", name, next=other)
             if mask.is_file():

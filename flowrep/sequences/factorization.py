@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from flowrep.geometry import camera_motion, factorize, relative_motion
-from flowrep.sequences.files import Flow
+from flowrep.sequences.files import FlowMap
 from flowrep.sequences.recording import Frame, Pose, SequenceError
 
 if TYPE_CHECKING:
@@ -60,19 +60,19 @@ class FactorizedFrame:
 
     frame: Frame
     previous: Frame
-    raw: Flow
-    ego: Flow
-    obj: Flow
+    raw: FlowMap
+    ego: FlowMap
+    obj: FlowMap
     valid: NDArray[np.bool_]
     ego_valid: NDArray[np.bool_]
     motion: Motion
 
 
-FlowSource = Callable[[Frame, Frame], Flow]  # from t' and t to raw flow, nan where unknown
-MotionSource = Callable[[Frame, Frame, Flow], Motion]  # from these and raw flow
+FlowSource = Callable[[Frame, Frame], FlowMap]  # from t' and t to raw flow, nan where unknown
+MotionSource = Callable[[Frame, Frame, FlowMap], Motion]  # from these and raw flow
 
 
-def recorded_flow(previous: Frame, current: Frame) -> Flow:
+def recorded_flow(previous: Frame, current: Frame) -> FlowMap:
     """Returns the recorded flow, if it is measured from the previous frame."""
     if current.raw is None:
         raise SequenceError(current.source, "has no flow of its own: use flow=estimated")
@@ -99,7 +99,7 @@ class EstimatedFlowSource:
     check_consistency: bool = True
 
     @torch.no_grad()
-    def __call__(self, previous: Frame, current: Frame) -> Flow:
+    def __call__(self, previous: Frame, current: Frame) -> FlowMap:
         """Returns raw flow; all of it is unknown if a picture repeats although the camera moved."""
         if previous.rgb is None or current.rgb is None:
             cause = "has no picture to estimate flow from: use flow=exact"
@@ -116,7 +116,7 @@ class EstimatedFlowSource:
         return raw
 
 
-def consistent(back: Flow, forth: Flow) -> NDArray[np.bool_]:
+def consistent(back: FlowMap, forth: FlowMap) -> NDArray[np.bool_]:
     """Returns where a pixel that follows both flows returns to its position, `[H, W]`.
 
     Each flow `[2, H, W]` is on the grid of the picture that it starts from.
@@ -158,7 +158,7 @@ def pairs(frames: Iterable[Frame]) -> Iterator[tuple[Frame | None, Frame]]:
             previous = current
 
 
-def recorded_motion(previous: Frame, current: Frame, raw: Flow) -> Motion:
+def recorded_motion(previous: Frame, current: Frame, raw: FlowMap) -> Motion:
     """Returns the camera's motion from the recorded poses."""
     if previous.world_from_cam is None or current.world_from_cam is None:
         raise SequenceError(current.source, "has no pose: use poses=estimated")
@@ -166,7 +166,7 @@ def recorded_motion(previous: Frame, current: Frame, raw: Flow) -> Motion:
     return Motion(relative_motion(*poses, dtype=torch.float64).numpy())
 
 
-def estimated_motion(previous: Frame, current: Frame, raw: Flow) -> Motion:
+def estimated_motion(previous: Frame, current: Frame, raw: FlowMap) -> Motion:
     """Returns the camera's motion that fits the flow and depth of most pixels."""
     depth, K = torch.from_numpy(current.depth)[None], torch.from_numpy(current.K).float()
     picture = None
@@ -205,7 +205,7 @@ def factorize_frames(
 
 
 def factorize_pair(
-    previous: Frame, current: Frame, raw: Flow, motion: Motion | None = None
+    previous: Frame, current: Frame, raw: FlowMap, motion: Motion | None = None
 ) -> FactorizedFrame:
     """Returns the factorisation of one frame, by default with the recorded motion."""
     motion = recorded_motion(previous, current, raw) if motion is None else motion

@@ -21,7 +21,7 @@ from flowrep.sequences.recording import SequenceError
 
 DepthCoding: TypeAlias = Literal["float32_rgba", "rgb24"]
 FlowCoding: TypeAlias = Literal["kitti", "vkitti2", "kubric"]
-Flow: TypeAlias = NDArray[np.float32]  # [2, H, W], u right, v down; nan where unknown
+FlowMap: TypeAlias = NDArray[np.float32]  # [2, H, W], u right, v down; nan where unknown
 
 _SUFFIXES = {
     "picture": (".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".bmp", ".tif", ".tiff", ".npy"),
@@ -70,7 +70,7 @@ def _natural(name: str) -> list[int | str]:
 
 def with_suffix(path: Path, kind: str) -> Path:
     """Returns a file's path, with the first suffix of its kind that exists if it has none."""
-    if path.name.lower().endswith(tuple(_SUFFIXES[kind])):
+    if path.name.lower().endswith(_SUFFIXES[kind]):
         return path
     paths = [path.with_name(path.name + suffix) for suffix in _SUFFIXES[kind]]
     return next((found for found in paths if found.exists()), path)
@@ -203,7 +203,7 @@ def read_depth(
         given = f"holds {stored.dtype} {list(stored.shape)}"
         wanted = "one channel of 16 bits or floats" if coding is None else f"depth_coding={coding}"
         raise SequenceError(path, f"{given}, expected {wanted}")
-    unit_m = (0.001 if is_whole else 1.0) if unit_m is None else unit_m
+    unit_m = _usual_unit_m(stored) if unit_m is None else unit_m
     depth = (stored * np.float64(unit_m)).astype(np.float32)
     if is_whole:
         depth[np.isin(stored, list(missing))] = np.nan
@@ -214,7 +214,11 @@ def read_depth(
 
 def usual_unit_m(path: Path, coding: DepthCoding | None = None) -> float:
     """Returns the metres of a 1 that a file stores: 0.001 for whole numbers, 1 for floats."""
-    return 0.001 if _without_coding(path, coding).dtype.kind in "ui" else 1.0
+    return _usual_unit_m(_without_coding(path, coding))
+
+
+def _usual_unit_m(stored: NDArray[Any]) -> float:
+    return 0.001 if stored.dtype.kind in "ui" else 1.0
 
 
 def _without_coding(path: Path, coding: DepthCoding | None) -> NDArray[Any]:
@@ -227,7 +231,7 @@ def _without_coding(path: Path, coding: DepthCoding | None) -> NDArray[Any]:
     return stored
 
 
-def read_flow(path: Path, coding: FlowCoding = "kitti") -> Flow:
+def read_flow(path: Path, coding: FlowCoding = "kitti") -> FlowMap:
     """Returns the first two channels of a file as flow `[2, H, W]`, nan where unknown.
 
     Args:
@@ -258,7 +262,7 @@ def read_flow(path: Path, coding: FlowCoding = "kitti") -> Flow:
     return flow
 
 
-def write_flo(path: Path, flow: Flow, valid: NDArray[np.bool_] | None = None) -> None:
+def write_flo(path: Path, flow: FlowMap, valid: NDArray[np.bool_] | None = None) -> None:
     """Writes flow `[2, H, W]`; invalid pixels get the format's value for unknown flow."""
     _, height, width = flow.shape
     known = np.isfinite(flow).all(0) & (valid is None or valid)
@@ -267,7 +271,7 @@ def write_flo(path: Path, flow: Flow, valid: NDArray[np.bool_] | None = None) ->
     path.write_bytes(header + marked.astype("<f4").tobytes())
 
 
-def write_kitti_flow(path: Path, flow: Flow) -> None:
+def write_kitti_flow(path: Path, flow: FlowMap) -> None:
     """Writes flow `[2, H, W]` in steps of 1/64 px; flow beyond 512 px is marked as unknown."""
     known = np.isfinite(flow).all(0)
     steps = np.rint(np.where(known, flow, 0.0) * 64) + 2**15

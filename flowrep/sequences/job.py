@@ -72,18 +72,14 @@ class Job:
         """Factorises all frames; returns 0, or the exit code of the signal that stopped it."""
         is_recording = isinstance(self.stream, Recording)
         total = len(self._indices) if is_recording else None
+        flow_source = self.clock("raw flow")(self.flow_source)
+        motion_source = self.clock("motion")(self.motion_source)
+        results = factorization.factorize_frames(self._frames(), flow_source, motion_source)
         with StopRequest() as interrupted, tqdm(total=total, unit="frame") as bar:
-            indices, pairs = count(self.start, self.stride), factorization.pairs(self._frames())
-            for index, (previous, current) in zip(indices, pairs):
-                if previous is not None:
-                    with self.clock("raw flow"):
-                        raw = self.flow_source(previous, current)
-                    with self.clock("motion"):
-                        motion = self.motion_source(previous, current, raw)
-                    with self.clock("factorising"):
-                        factorized = factorization.factorize_pair(previous, current, raw, motion)
+            for index, result in zip(count(self.start, self.stride), results):
+                if result is not None:
                     with self.clock("writing"):
-                        self.output.append(index, factorized)
+                        self.output.append(index, result)
                 bar.update()
                 if interrupted:
                     break

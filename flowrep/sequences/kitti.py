@@ -50,8 +50,10 @@ class Kitti(Recording):
                 self.folder, "has no image_2/*_10.png: give training/ of the data set"
             )
         self.count = 2 * len(self._pairs)
-        if raw_data is None:
+        if raw_data is None and mapping is None:
             return
+        if raw_data is None:
+            raise SequenceError(mapping, "needs format.raw_data=<raw recordings>, too")
         if mapping is None:
             raise SequenceError(raw_data, "needs format.mapping=train_mapping.txt, too")
         self._oxts = {}  # the folder of GPS and IMU packets and the frame number, by pair

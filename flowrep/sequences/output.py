@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from flowrep import viz
 from flowrep.extras import require
 from flowrep.sequences.factorization import FactorizedFrame, factorize_pair
-from flowrep.sequences.files import Flow, write_flo, write_kitti_flow, write_picture
+from flowrep.sequences.files import FlowMap, write_flo, write_kitti_flow, write_picture
 from flowrep.sequences.recording import Frame, Pose, SequenceError
 from flowrep.tables import append_rows
 
@@ -31,6 +31,7 @@ class Output:
     """The folder of a job: `<path>.partial` while it runs, `<path>` once it is complete.
 
     Args:
+        path: the folder, which must not exist yet.
         settings: of the job, written to `job.json`.
         flow_files: formats of flow files: any of "flo", "kitti" and "npz".
         pictures_every: the number of frames from one set of flow pictures to the next; 0 for none.
@@ -39,6 +40,7 @@ class Output:
         moving_px: the object flow above which a pixel may count as moving.
         masks: whether to write a mask of moving pixels for each frame.
         video_fps: None for no video.
+        rerun: whether to write `scene.rrd` for the viewer rerun.
     """
 
     def __init__(
@@ -66,8 +68,9 @@ class Output:
             require("rerun=true", "rerun", "rerun")
         self.flow_files, self.pictures_every, self.moving_px = flow_files, pictures_every, moving_px
         self.scale_px = scale_px or dict.fromkeys(FLOW_NAMES, 20.0)
-        self.depth_range_m, self.rows = depth_range_m, list[dict[str, Any]]()
-        self.masks, self._poses = masks, dict[str, Pose]()
+        self.depth_range_m, self.masks = depth_range_m, masks
+        self.rows: list[dict[str, Any]] = []
+        self._poses: dict[str, Pose] = {}
         self.partial.mkdir(parents=True)
         self._write_json("job.json", settings)
         self._video = viz.Video(self.partial / "strip.mp4", fps=video_fps) if video_fps else None
@@ -236,7 +239,7 @@ def _median(values: NDArray[np.float32]) -> float:
     return float(np.median(values)) if len(values) else math.nan
 
 
-def shown(kind: str, result: FactorizedFrame) -> Flow:
+def shown(kind: str, result: FactorizedFrame) -> FlowMap:
     """Returns a flow with nan where it is unknown, which is drawn in grey."""
     if kind == "raw":
         return result.raw

@@ -39,6 +39,7 @@ class Frame:
         K: `[3, 3]`, pixels.
         depth: `[H, W]`, metres.
         rgb: `[H, W, 3]`.
+        timestamp_s: seconds, in the recording's own clock.
         raw: `[2, H, W]`, the recorded flow p_t - p_t'; nan where unknown.
         raw_since: the name of the frame t' from which `raw` is measured, None if it is missing.
         clip: the number of its clip. There is no flow from one clip to another.
@@ -80,6 +81,8 @@ class Recording(ABC):
     missing ones.
 
     Attributes:
+        has_flow: whether frames have recorded flow, `raw`.
+        has_poses: whether frames have `world_from_cam`.
         no_flow: why there is no recorded flow, and what to do.
         notes: sentences for the user.
         conventions: the options about conventions with which it was opened, for the diagnosis.

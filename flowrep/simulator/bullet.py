@@ -1,4 +1,4 @@
-"""Bodies, collisions and pictures by PyBullet; no other module imports it."""
+"""Bodies, collisions and pictures of a street by PyBullet."""
 
 import functools
 import math

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrep.choices import Renderer
 from flowrep.simulator.motion import rigid_inverse
 
 if TYPE_CHECKING:  # scenes need shapely and pydantic, which `flowrep.pybullet` shouldn't import
@@ -88,11 +89,8 @@ def depth_from_zbuffer(
     return np.float32(far_m * near_m) / gap
 
 
-RENDERERS = ("auto", "rasteriser", "pybullet")
-
-
 def choose_renderer(name: str) -> str:
     """Returns "rasteriser" or "pybullet"; "auto" is the rasteriser."""
-    if name not in RENDERERS:
-        raise ValueError(f"unknown renderer {name!r}; choose one of {', '.join(RENDERERS)}")
+    if name not in (known := get_args(Renderer)):
+        raise ValueError(f"unknown renderer {name!r}; choose one of {', '.join(known)}")
     return "rasteriser" if name == "auto" else name

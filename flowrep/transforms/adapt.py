@@ -150,7 +150,7 @@ class AdaptPose(MapTransform):
             is_absent = pose.flatten(-own_dims).isnan().all(-1)
             if is_absent.all():
                 return
-            # in place of the absent ones, so that an error names the right row
+            # In place of the absent ones, so that an error names the right row.
             mask = is_absent.reshape(*is_absent.shape, *[1] * own_dims)
             pose = torch.where(mask, pose[~is_absent][0], pose)
         geometry.adapt_pose(pose, check=True, **self.options)

@@ -42,6 +42,8 @@ class Reads(NamedTuple):
         return f"{'' if self.kind == 'any' else self.kind + ' '}[*B, {sizes}]"
 
 
+CALLS_PER_LOOK = 100  # on a GPU, one call of this many checks values: each check waits for them
+
 DEPTH = Reads((1, "H", "W"), "float")
 IDS = Reads((1, "H", "W"), "integer")
 FLOW = Reads((2, "H", "W"), "float")

@@ -21,8 +21,7 @@ from flowrep.transforms.flow import Intrinsics
 from flowrep.transforms.maps import InstanceIds
 from flowrep.transforms.motion import CameraMotion, InstanceMotion
 
-Options: TypeAlias = Mapping[str, Any]
-Layout: TypeAlias = Literal["hw", "hwc"]
+MapLayout: TypeAlias = Literal["hw", "hwc"]
 
 _PARTS = "adapted"  # only the next adapter reads the keys under it
 
@@ -56,17 +55,17 @@ class Convention:
     simulator: str
     sources: tuple[str, ...]
     tried: str = ""
-    layout: Layout = "hw"
-    ids_layout: Layout | None = None
-    depth: Mapping[str, Options]
+    layout: MapLayout = "hw"
+    ids_layout: MapLayout | None = None
+    depth: Mapping[str, Mapping[str, Any]]
     pose: tuple[str, ...]
-    pose_options: Options
+    pose_options: Mapping[str, Any]
     bodies: tuple[str, ...]
-    bodies_options: Options = field(default_factory=dict)
+    bodies_options: Mapping[str, Any] = field(default_factory=dict)
     ids: str
     background: tuple[int, ...] = (0,)
     flow: str = ""
-    flow_options: Options = field(default_factory=dict)
+    flow_options: Mapping[str, Any] = field(default_factory=dict)
     K: str
     notes: str = ""
 
@@ -371,10 +370,12 @@ def sensors_from(
     def key(name: str) -> NestedKey:
         return elsewhere.pop(name, (*root, name) if root else name)
 
-    def plane(name: str, layout: Layout) -> Transform:
+    def plane(name: str, layout: MapLayout) -> Transform:
         return Plane(layout, in_keys=key(name), out_keys=(_PARTS, name))
 
-    def poses(names: tuple[str, ...], options: Options, written: NestedKey) -> list[Transform]:
+    def poses(
+        names: tuple[str, ...], options: Mapping[str, Any], written: NestedKey
+    ) -> list[Transform]:
         if len(names) == 1:
             return [AdaptPose(**options, in_keys=key(names[0]), out_keys=written)]
         joined: NestedKey = (_PARTS, written[-1])
@@ -415,7 +416,7 @@ class Plane(MapTransform):
         layout: `"hw"` or `"hwc"`.
     """
 
-    def __init__(self, layout: Layout, *, in_keys: Keys, out_keys: Keys) -> None:
+    def __init__(self, layout: MapLayout, *, in_keys: Keys, out_keys: Keys) -> None:
         shape = ("H", "W") if layout == "hw" else ("H", "W", "C")
         super().__init__([Reads(shape)], in_keys, out_keys)
 

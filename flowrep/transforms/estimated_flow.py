@@ -292,9 +292,11 @@ class EstimatedFlow(FlowTransform):
         if intrinsics is not None:
             reads, keys = [*reads, base.DEPTH, base.MOTION], [*keys, *EGO_KEYS]
         keys = keys if in_keys is None else in_keys
+        if scale != 1.0 and "raw" not in outputs:
+            raise ValueError(f"scale={scale} is for raw, which outputs={list(outputs)} lacks")
         scales = {name: scale if name == "raw" else 1.0 for name in outputs}
-        options = (outputs, scales, False, prev_intrinsics)
-        super().__init__(intrinsics, reads, keys, out_keys, *options)
+        options: Any = {"outputs": outputs, "scale": scales, "prev_intrinsics": prev_intrinsics}
+        super().__init__(intrinsics, reads, keys, out_keys, **options)
         self.estimator = _estimator(estimator, weights, preset, min_side_px)
         self.picture_scale = checked_count("picture_scale", picture_scale)
 

@@ -30,11 +30,10 @@ from flowrep.transforms.base import (
 )
 
 CAMERA = Reads((3, 3), "float")
-_DEPTH: NestedKey = ("sensor", "depth")
-_RAW_KEYS: Keys = [_DEPTH, ("sensor", "instance"), ("sensor", "instance_motion")]
-EGO_KEYS: list[NestedKey] = [_DEPTH, ("sensor", "prev_from_curr")]
+DEPTH_KEY: NestedKey = ("sensor", "depth")
+_RAW_KEYS: Keys = [DEPTH_KEY, ("sensor", "instance"), ("sensor", "instance_motion")]
+EGO_KEYS: list[NestedKey] = [DEPTH_KEY, ("sensor", "prev_from_curr")]
 
-_CALLS_PER_LOOK = 100  # on a GPU, one call of this many checks the values of K
 _SAME_CAMERA = 1e-5  # share of fx by which K may differ: 0.01 px for a picture 1,000 px wide
 
 # K itself, or the key under which the env gives it.
@@ -66,6 +65,7 @@ class CameraTransform(MapTransform):
         reads: Sequence[Reads],
         in_keys: Keys,
         out_keys: Keys,
+        *,
         writes: int = 1,
         prev_intrinsics: NestedKey | None = None,
     ) -> None:
@@ -85,9 +85,8 @@ class CameraTransform(MapTransform):
                     "the key of the current frame's"
                 )
             keys += as_keys([prev_intrinsics])
-        super().__init__(
-            [*reads, *[CAMERA] * len(keys)], [*as_keys(in_keys), *keys], out_keys, writes
-        )
+        reads = [*reads, *[CAMERA] * len(keys)]
+        super().__init__(reads, [*as_keys(in_keys), *keys], out_keys, writes)
         self.register_buffer("K", K, persistent=False)
         self.camera_keys = keys
         self._calls = 0
@@ -118,7 +117,7 @@ class CameraTransform(MapTransform):
         if torch.compiler.is_compiling() or K.is_meta:
             return False
         # 0 is the first reset, 1 the first step.
-        return K.is_cpu or self._calls % _CALLS_PER_LOOK < 2
+        return K.is_cpu or self._calls % base.CALLS_PER_LOOK < 2
 
     def _check_one_camera(
         self, before: Tensor | None, now: Tensor | None, done: Callable[[], Tensor | None]
@@ -207,6 +206,7 @@ class FlowTransform(CameraTransform):
         reads: Sequence[Reads],
         in_keys: Keys,
         out_keys: Keys | None,
+        *,
         outputs: Sequence[str],
         scale: float | Mapping[str, float],
         compiled: bool = False,
@@ -214,7 +214,8 @@ class FlowTransform(CameraTransform):
     ) -> None:
         check_choice("outputs", outputs, self.known)
         keys = as_keys(list(outputs) if out_keys is None else out_keys)
-        super().__init__(intrinsics, reads, in_keys, keys, len(outputs), prev_intrinsics)
+        options: Any = {"writes": len(outputs), "prev_intrinsics": prev_intrinsics}
+        super().__init__(intrinsics, reads, in_keys, keys, **options)
         self.outputs = tuple(outputs)
         masks = [mask_key(key) for name, key in zip(outputs, keys) if name in self.masked]
         self.masks = [key for key in masks if key not in keys]
@@ -331,8 +332,9 @@ class RawFlow(FlowTransform):
     ) -> None:
         reads = [base.DEPTH, base.IDS, base.MOTIONS]
         keys = _RAW_KEYS if in_keys is None else in_keys
-        options = (outputs, scale, compiled, prev_intrinsics)
-        super().__init__(intrinsics, reads, keys, out_keys, *options)
+        options: Any = {"outputs": outputs, "scale": scale, "compiled": compiled}
+        options |= {"prev_intrinsics": prev_intrinsics}
+        super().__init__(intrinsics, reads, keys, out_keys, **options)
 
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
         """Returns the chosen outputs, from depth, instance ids and motions (and K)."""
@@ -419,8 +421,9 @@ class FlowFactorize(FlowTransform):
         if {"obj", "raw"} & set(outputs):
             reads, keys = [base.FLOW, *reads], ["raw", *EGO_KEYS]
         keys = keys if in_keys is None else in_keys
-        options = (outputs, scale, compiled, prev_intrinsics)
-        super().__init__(intrinsics, reads, keys, out_keys, *options)
+        options: Any = {"outputs": outputs, "scale": scale, "compiled": compiled}
+        options |= {"prev_intrinsics": prev_intrinsics}
+        super().__init__(intrinsics, reads, keys, out_keys, **options)
         if self.scales.get("raw", 1.0) != 1.0:
             check_distinct_keys(self)
 

@@ -55,6 +55,7 @@ class Mirror(Transform):
         ValueError: `in_keys` repeats a key, `flow_keys` holds a key that `in_keys` lacks,
             `swapped_actions` doesn't exchange actions in pairs, K has skew, or 2·cx isn't whole; in
             calls, a map's width differs from 2·cx by half or more.
+        MissingKey: in calls, the batch lacks a map.
         RuntimeError: it is used in an env.
 
     Example:
@@ -100,7 +101,10 @@ class Mirror(Transform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns the batch with images instead of transitions, or appended to them."""
-        shape, device = tensordict.batch_size, tensordict[self.in_keys[0]].device
+        if lacking := [key for key in self.in_keys if tensordict.get(key, None) is None]:
+            known = sorted(tensordict.keys(True, True), key=str)
+            raise MissingKey(f"Mirror needs key {lacking[0]!r}; the batch has {known}")
+        shape, device = tensordict.batch_size, tensordict["action"].device
         if self.images == "half":
             drawn = [1 if name == "time" else n for name, n in zip(tensordict.names, shape)]
             chosen = (torch.rand(drawn, device=device) < 0.5).expand(shape)
@@ -127,9 +131,6 @@ class Mirror(Transform):
                 )
         for key in self.in_keys:
             is_flow = key in self.flow_keys
-            if tensordict.get(key, None) is None:
-                known = sorted(tensordict.keys(True, True), key=str)
-                raise MissingKey(f"Mirror needs key {key!r}; the batch has {known}")
             for step in (tensordict, following):
                 x = None if step is None else step.get(key, None)
                 if x is not None:
@@ -138,7 +139,7 @@ class Mirror(Transform):
         return tensordict
 
     def _check_width(self, key: NestedKey, width: int) -> None:
-        # pictures for estimated flow may be several times as large as the camera's maps
+        # Pictures for estimated flow may be several times as large as the camera's maps.
         if self.twice_cx is not None and not width / 1.5 < self.twice_cx < width * 1.5:
             raise ValueError(
                 f"{key!r} is {width} pixels wide, but 2·cx is {self.twice_cx}: it is not of the "

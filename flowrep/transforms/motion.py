@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict.utils import NestedKey
@@ -13,10 +14,9 @@ from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
 from flowrep import geometry
 from flowrep.transforms import base
 from flowrep.transforms.base import Keys, Reads, RecurrentTransform, as_keys, check_choice
-from flowrep.transforms.flow import CAMERA, CameraTransform, Intrinsics
+from flowrep.transforms.flow import CAMERA, DEPTH_KEY, CameraTransform, Intrinsics
 
 _POSES: Keys = [("sensor", "world_from_cam"), ("sensor", "world_from_body")]
-_DEPTH: NestedKey = ("sensor", "depth")
 _PICTURE = Reads((3, "kH", "kW"), "integer")
 # EstimateCameraMotion's outputs, with their keys.
 _ESTIMATES: dict[str, NestedKey] = {
@@ -153,13 +153,13 @@ class PreviousIntrinsics(RecurrentTransform):
 class EstimateCameraMotion(CameraTransform):
     """The camera's motion estimated from flow and depth, for envs and robots that give no pose.
 
-    | reads | writes | shape | unit |
-    | --- | --- | --- | --- |
-    | `"raw"`, px/step | `("sensor", "prev_from_curr")` | float32 `[*B, 4, 4]` | m |
-    | `("sensor", "depth")`, m | `("sensor", "inlier_share")` | float32 `[*B, 1]` | |
-    | `picture`, if given | `("sensor", "motion_covariance")` | float32 `[*B, 6, 6]` | rad, m |
-    | `prior`, if given | `("sensor", "motion_valid")` | bool `[*B, 1]` | |
-    | `"raw_valid"`, if there | | | |
+    | reads | writes | shape | range | unit |
+    | --- | --- | --- | --- | --- |
+    | `"raw"`, px/step | `("sensor", "prev_from_curr")` | float32 `[*B, 4, 4]` | rigid | m |
+    | `("sensor", "depth")`, m | `("sensor", "inlier_share")` | float32 `[*B, 1]` | 0 … 1 | |
+    | `picture`, if given | `("sensor", "motion_covariance")` | float32 `[*B, 6, 6]` | | rad, m |
+    | `prior`, if given | `("sensor", "motion_valid")` | bool `[*B, 1]` | | |
+    | `"raw_valid"`, if there | | | | |
 
     Convention, and where it fails: see `flowrep.geometry.camera_motion`. The result depends on the
     frame alone, so it is the same in an env, in any batch and on replay samples. If no motion can
@@ -208,13 +208,14 @@ class EstimateCameraMotion(CameraTransform):
     ) -> None:
         check_choice("outputs", outputs, _ESTIMATES)
         reads = [base.FLOW, base.DEPTH]
-        keys = as_keys(["raw", _DEPTH] if in_keys is None else in_keys)
+        keys = as_keys(["raw", DEPTH_KEY] if in_keys is None else in_keys)
         for key, layout in ((picture, _PICTURE), (prior, base.MOTION)):
             if key is not None:
                 reads.append(layout)
                 keys += as_keys([key])
         written = [_ESTIMATES[name] for name in outputs] if out_keys is None else out_keys
-        super().__init__(intrinsics, reads, keys, written, len(outputs), prev_intrinsics)
+        options: Any = {"writes": len(outputs), "prev_intrinsics": prev_intrinsics}
+        super().__init__(intrinsics, reads, keys, written, **options)
         self.outputs = tuple(outputs)
         self.has_picture, self.has_prior = picture is not None, prior is not None
 

@@ -20,7 +20,7 @@ from flowrep.transforms.motion import EstimateCameraMotion
 from flowrep.transforms.noise import NOISY_SENSORS, SensorNoise
 
 Representations = Sequence[str] | Mapping[str, Mapping[str, Any] | Transform | None]
-Options = dict[str, Any]
+Arguments = dict[str, Any]
 
 _SOURCES = ("exact", "estimated")
 _FLOW_OPTIONS = ("scale",)
@@ -34,10 +34,10 @@ _OPTIONS: dict[str, tuple[type[Transform], tuple[str, ...]]] = {
     "ego": (FlowFactorize, _FLOW_OPTIONS),
     "obj": (FlowFactorize, _FLOW_OPTIONS),
 }
-_FRAMES_OF = {"seg2": "seg", "depth2": "depth"}  # the last k frames
+FRAMES_OF = {"seg2": "seg", "depth2": "depth"}  # the last k frames
 FLOWS = ("raw", "ego", "obj")  # of two channels, u and v
 
-REPRESENTATIONS: tuple[str, ...] = (*_OPTIONS, *_FRAMES_OF)
+REPRESENTATIONS: tuple[str, ...] = (*_OPTIONS, *FRAMES_OF)
 
 _UNSCALED_KEY = "_raw"  # exact raw flow in px/step, for FlowFactorize
 _PICTURE_KEY = ("sensor", "rgb")
@@ -49,18 +49,18 @@ _NOISY_KEYS = {"depth": ("sensor", "noisy_depth"), "motion": ("sensor", "noisy_m
 _KEPT = (_PICTURES_KEY, _ESTIMATED_FLOW_KEY, _ESTIMATED_MOTION_KEY, *_NOISY_KEYS.values())
 
 
-def representation_options(name: str) -> Options:
+def representation_options(name: str) -> Arguments:
     """Returns a representation's options with their defaults.
 
     >>> representation_options("depth2")
     {'k': 2, 'range_m': 100.0, 'missing': 0.0}
     """
     _check_known("representation", [name], REPRESENTATIONS)
-    stacked = _defaults(FrameStack, ("k",)) if name in _FRAMES_OF else {}
-    return stacked | _defaults(*_OPTIONS[_FRAMES_OF.get(name, name)])
+    stacked = _defaults(FrameStack, ("k",)) if name in FRAMES_OF else {}
+    return stacked | _defaults(*_OPTIONS[FRAMES_OF.get(name, name)])
 
 
-def _defaults(transform: type[Transform], names: Sequence[str]) -> Options:
+def _defaults(transform: type[Transform], names: Sequence[str]) -> Arguments:
     parameters = inspect.signature(transform).parameters
     return {name: parameters[name].default for name in names}
 
@@ -178,7 +178,7 @@ def _check_known(what: str, names: Iterable[object], known: Collection[str]) -> 
             raise ValueError(f"unknown {what} {name!r}; known are {list(known)}")
 
 
-def _known_options(whose: str, given: Any, known: Collection[str]) -> Options:
+def _known_options(whose: str, given: Any, known: Collection[str]) -> Arguments:
     """Returns the options that were given; raises ValueError if one of them is unknown."""
     if not isinstance(given, Mapping | None):
         raise ValueError(f"options of {whose} must be a mapping from name to value, got {given!r}")
@@ -186,14 +186,14 @@ def _known_options(whose: str, given: Any, known: Collection[str]) -> Options:
     return dict(given or {})
 
 
-def _with_options(representations: Representations) -> tuple[dict[str, Options], dict[str, Any]]:
+def _with_options(representations: Representations) -> tuple[dict[str, Arguments], dict[str, Any]]:
     """Returns the representations with all of their options, and the user's transforms, by name."""
     if isinstance(representations, str) or not representations:
         raise ValueError(
             f"representations must be a list of names, some of {list(REPRESENTATIONS)}; "
             f"got {representations!r}"
         )
-    chosen: dict[str, Options] = {}
+    chosen: dict[str, Arguments] = {}
     foreign: dict[str, Transform] = {}
     for name in representations:
         if name in chosen:
@@ -212,9 +212,9 @@ def _with_options(representations: Representations) -> tuple[dict[str, Options],
     return chosen, foreign
 
 
-def _estimator_options(flow: str | Mapping[str, Any]) -> Options | None:
+def _estimator_options(flow: str | Mapping[str, Any]) -> Arguments | None:
     """Returns `EstimatedFlow`'s options, or None if flow is exact."""
-    options: Options = dict(flow) if isinstance(flow, Mapping) else {"source": flow}
+    options: Arguments = dict(flow) if isinstance(flow, Mapping) else {"source": flow}
     source = options.pop("source", None)
     _check_known("source of flow", [source], _SOURCES)
     known = _ESTIMATOR_OPTIONS if source == "estimated" else ()
@@ -232,7 +232,7 @@ def _noise(
     """
     options = {sensor: NOISY_SENSORS[sensor].options for sensor in _NOISY_KEYS}
     known = dict.fromkeys((name for names in options.values() for name in names), 0.0)
-    given: Options = known | _known_options("noise", noise, known)
+    given: Arguments = known | _known_options("noise", noise, known)
     SensorNoise(**given)  # checks all values, used or not
     split = [name for name in chosen if name in ("ego", "obj")]
     readers = {  # raw flow is exact or estimated from pictures: it needs no noisy sensor
@@ -253,11 +253,11 @@ def _noise(
 
 
 def _maps(
-    chosen: Mapping[str, Options], num_classes: int | None, depth_key: NestedKey
+    chosen: Mapping[str, Arguments], num_classes: int | None, depth_key: NestedKey
 ) -> list[Transform]:
     """Returns the transforms of rgb, seg and depth, followed by those that stack their frames."""
 
-    def one(name: str, key: str, options: Options) -> Transform:
+    def one(name: str, key: str, options: Arguments) -> Transform:
         if name == "rgb":
             return Rgb(out_keys=key)
         if name == "seg":
@@ -269,10 +269,10 @@ def _maps(
     for name, options in chosen.items():
         if name in FLOWS:
             continue
-        if name not in _FRAMES_OF:
+        if name not in FRAMES_OF:
             maps.append(one(name, name, options))
             continue
-        frame = _FRAMES_OF[name]
+        frame = FRAMES_OF[name]
         of_frame = {option: value for option, value in options.items() if option != "k"}
         is_shared = chosen.get(frame) == of_frame
         key = frame if is_shared else f"_{frame}"
@@ -286,18 +286,18 @@ def _maps(
 class _Camera:
     """What the flow transforms have in common: K, and the keys of depth and motion."""
 
-    k: Options
+    k: Arguments
     depth: NestedKey
     motion: NestedKey
     compiled: bool
 
     @property
-    def options(self) -> Options:
+    def options(self) -> Arguments:
         return {**self.k, "compiled": self.compiled}
 
 
 def _exact_flow(
-    flows: Mapping[str, Options], camera: _Camera, needs_unscaled: bool, estimates_motion: bool
+    flows: Mapping[str, Arguments], camera: _Camera, needs_unscaled: bool, estimates_motion: bool
 ) -> list[Transform]:
     """Returns `RawFlow` and, with `estimates_motion`, the transform that estimates the motion.
 
@@ -310,7 +310,7 @@ def _exact_flow(
 
 
 def _estimated_flow(
-    flows: Mapping[str, Options], estimator: Options, camera: _Camera, estimates_motion: bool
+    flows: Mapping[str, Arguments], estimator: Arguments, camera: _Camera, estimates_motion: bool
 ) -> list[Transform]:
     """Returns the transforms of picture pairs, flow and, with `estimates_motion`, camera motion.
 
@@ -319,7 +319,7 @@ def _estimated_flow(
     """
     pictures = FrameStack(k=2, in_keys=[_PICTURE_KEY], out_keys=[_PICTURES_KEY])
     has_raw = "raw" in flows
-    written: Options = {
+    written: Arguments = {
         "outputs": ["unscaled", "raw"] if has_raw else ["unscaled"],
         "out_keys": [_ESTIMATED_FLOW_KEY, "raw"] if has_raw else [_ESTIMATED_FLOW_KEY],
         **flows.get("raw", {}),
@@ -355,7 +355,9 @@ def _motion(flow: NestedKey, camera: _Camera, picture: NestedKey | None = None) 
     )
 
 
-def _split(factors: Mapping[str, Options], unscaled: NestedKey, camera: _Camera) -> list[Transform]:
+def _split(
+    factors: Mapping[str, Arguments], unscaled: NestedKey, camera: _Camera
+) -> list[Transform]:
     """Returns one `FlowFactorize` for the flows that no source has written."""
     if not factors:
         return []

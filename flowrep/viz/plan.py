@@ -123,7 +123,7 @@ def _draw_zones(axes: Axes, layout: Layout) -> list[Any]:
             if name in named:
                 continue
             named.add(name)
-            zone = next(zone for zone in scene.zones if zone.name == name)
+            zone = layout.zone_of[name]
             x, y, heading = layout.pose_at(zone.road, (zone.from_m + zone.to_m) / 2)
             # Starts are named to the left of the road and ends to its right, because a zone may be
             # both.

@@ -1,13 +1,19 @@
 """Is Straight Road a fair task? A small count here; `examples/scene_validity.py` has the rest."""
 
 from itertools import product
+from typing import get_args
 
 import numpy as np
 import pytest
 import shapely
 
-from flowrep.baselines import Planner
+from flowrep.baselines import BASELINES, Planner
 from flowrep.baselines.planner import GoalDistance
+from flowrep.choices import BaselineName
+
+
+def test_the_commands_know_every_baseline():
+    assert set(BASELINES) == set(get_args(BaselineName))
 
 
 @pytest.mark.slow_after_first

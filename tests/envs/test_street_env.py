@@ -280,20 +280,20 @@ def test_reset_options_that_cannot_be_are_refused(make_street, empty_road):
         ("episode_seed", 1.7, "episode_seed is 1.7"),
         ("episode_seed", "1", "episode_seed is '1'"),
         ("episode_seed", -1, "episode_seed is -1"),
-        ("episode_seed", 1 << 63, "episode_seed is 9223372036854775808"),
+        ("episode_seed", 1 << 62, "episode_seed is 4611686018427387904"),
         ("vehicle_speed_mps", math.nan, "vehicle_speed_mps is nan"),
         ("vehicle_speed_mps", -10.0, "vehicle_speed_mps is -10.0"),
         ("vehicle_speed_mps", "10", "vehicle_speed_mps is '10'"),
         ("speed", (1.0, math.nan), r"speed is \(1.0, nan\)"),
-        ("state", 5, "none that get_state returned"),
-        ("state", {"steps": 3}, "none that get_state returned: KeyError"),
+        ("state", 5, "get_state"),
+        ("state", {"steps": 3}, "get_state.*KeyError"),
     ):
         with pytest.raises(ValueError, match=message):
             env.reset(options={option: value})
     state = env.reset(seed=0) and env.get_state()
     with pytest.raises(ValueError, match=r"path.*state"):  # it would be ignored
         env.reset(options={"state": state, "path": "main"})
-    last = (1 << 31) - 1
+    last = (1 << 62) - 1
     assert env.reset(options={"episode_seed": np.int64(last)})[1]["episode_seed"] == last
 
 

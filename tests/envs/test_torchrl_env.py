@@ -195,6 +195,13 @@ def test_flow_is_compiled_where_that_is_asked_for(make, monkeypatch):
         assert flows == [compiled, compiled]
 
 
+def test_pictures_and_estimator_have_one_scale_however_flow_is_named(make):
+    pytest.importorskip("cv2", reason="DIS is OpenCV's: pip install 'flowrep-rl[flow]'")
+    for flow in ("estimated", {"source": "estimated"}, {"source": "estimated", "picture_scale": 2}):
+        env = make(representations=["raw"], flow=flow, picture_scale=2, seed=0)
+        assert env.reset()["raw"].shape == (1, 2, 84, 84)  # rival: that of the pictures, 168
+
+
 def test_options_of_a_representation_reach_its_transform(make):
     plain = make(representations=["depth"], seed=0).reset()["depth"]
     near = make(representations={"depth": {"range_m": 10.0}}, seed=0).reset()["depth"]

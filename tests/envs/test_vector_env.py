@@ -75,6 +75,14 @@ def test_environments_with_different_cameras_are_not_drawn_together():
         StreetVectorEnv([one, other])
 
 
+def test_the_largest_seed_of_an_episode_is_in_the_spaces_which_can_be_sampled():
+    vector = make(sensors=("frame",))
+    observation, _ = vector.reset(options={"episode_seed": (1 << 62) - 1})
+    assert observation in vector.observation_space
+    assert vector.observation_space.sample() in vector.observation_space
+    vector.close()
+
+
 @pytest.mark.parametrize("mask", [(True, False, False), (False, False, False)])
 def test_a_reset_of_some_or_none_returns_what_was_last_seen_as_the_callers_own(mask):
     ours = make(sensors=("depth",))

@@ -1,10 +1,13 @@
 """What a run is, and which runs may be compared: no two configs are ever taken for one."""
 
+from typing import get_args
+
 import pytest
 
 pytest.importorskip("scipy", reason="reports are an extra")
 
-from flowrep.report.runs import groups_of
+from flowrep.choices import BaselineName
+from flowrep.report.runs import DRAWN_BASELINES, groups_of
 from flowrep.report.storage import read_run, read_runs
 from tests.report.folders import config_of, rows_of, run_in, write_run
 
@@ -12,6 +15,10 @@ from tests.report.folders import config_of, rows_of, run_in, write_run
 def labels(folder):
     runs, _ = read_runs([folder])
     return {group.label: sorted(r.folder.name for r in group.runs) for group in groups_of(runs)}
+
+
+def test_every_baseline_is_drawn():
+    assert set(DRAWN_BASELINES) == set(get_args(BaselineName))
 
 
 def test_what_a_run_is_comes_from_its_config(tmp_path):

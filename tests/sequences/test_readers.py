@@ -11,7 +11,7 @@ pytest.importorskip("cv2", reason="recordings need OpenCV")
 
 import cv2
 
-from flowrep.sequences import factorize_frames, open_recording, recorded_flow
+from flowrep.sequences import SequenceError, factorize_frames, open_recording, recorded_flow
 from tests.sequences import synthetic
 from tests.sequences.synthetic import HEIGHT, OPENCV_INTRINSICS, WIDTH
 
@@ -23,6 +23,15 @@ def opener(name, **options):
 def open_kitti(folder):
     files = {"raw_data": folder / "raw", "mapping": folder / "train_mapping.txt"}
     return open_recording(folder / "training", "kitti", **files)
+
+
+def test_kitti_needs_both_files_for_poses(tmp_path):
+    synthetic.write_kitti(tmp_path)
+    training = tmp_path / "training"
+    with pytest.raises(SequenceError, match=r"format\.raw_data"):
+        open_recording(training, "kitti", mapping=tmp_path / "train_mapping.txt")
+    with pytest.raises(SequenceError, match=r"format\.mapping"):
+        open_recording(training, "kitti", raw_data=tmp_path / "raw")
 
 
 CAMERA = (31.0, 27.0, 18.5, 13.0)

@@ -49,6 +49,11 @@ def test_flow_is_now_minus_before_u_right_and_v_down(height, width):
     torch.testing.assert_close(torch.stack([u, v]), torch.tensor([3.0, -2.0]), atol=0.1, rtol=0)
 
 
+def test_a_scale_without_raw_is_refused():
+    with pytest.raises(ValueError, match=r"scale=2\.0.*unscaled"):
+        T.EstimatedFlow(outputs=["unscaled"], scale=2.0)
+
+
 def test_the_estimator_runs_from_the_current_picture_to_the_previous_one():
     pair = shifted_pair(6, 8, right=1, down=2)
 

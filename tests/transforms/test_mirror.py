@@ -175,8 +175,12 @@ def test_a_batch_may_lack_the_next_maps_but_not_its_own():
     rest = mirror()(td.clone().exclude(("next", "raw"), ("next", "seg")))
     assert torch.equal(rest["raw"], image(td)["raw"])
     assert same(rest["next"], td["next"].select("reward"))
-    with pytest.raises(MissingKey, match="seg"):
-        mirror()(td.exclude("seg"))
+    for key in ("raw", "seg"):  # the first and the last
+        incomplete = td.exclude(key)
+        before = incomplete.clone()
+        with pytest.raises(MissingKey, match=key):
+            mirror()(incomplete)
+        assert same(incomplete, before)
 
 
 @pytest.mark.parametrize(
