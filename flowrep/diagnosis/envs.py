@@ -263,7 +263,7 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[str, str]:
     ):  # fmt: skip
         is_off = int(of.sum()) >= _FEW_FRAMES and median(left[of] - least[of]) > 0
         if is_off and is_better(best[of], left[of]):
-            size = f"{median(left[of]):.2g} px are left of {median(moved_px[of]):.2g} px"
+            size = f"{median(left[of]):.2g} px are left (flow: {median(moved_px[of]):.2g} px)"
             why = f"instance_motion or ids don't fit {says}: {size}"
             why += f", and a motion exists that would leave {median(best[of]):.2g} px"
             return "fault", why

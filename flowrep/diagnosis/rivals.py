@@ -29,7 +29,7 @@ class Rival(NamedTuple):
 
     Attributes:
         of: what it is a mistake of.
-        typed: the option that mends it, or what to do; with the fitted numbers in braces.
+        typed: the option that corrects it, or what to do; with the fitted numbers in braces.
         says: the mistake in words, likewise.
         change: corrects pairs, given numbers `[P, k]`.
         start: where the fit of the numbers starts; the best end counts.
@@ -49,7 +49,7 @@ class Rival(NamedTuple):
     in_pixels: bool = False
 
     def texts(self, numbers: Tensor, width: int) -> tuple[str, str]:
-        """Returns what mends the mistake, and what it is, with the numbers that were learnt."""
+        """Returns what corrects the mistake, and what it is, with the numbers that were learnt."""
         n, values = [*numbers.tolist(), 0.0, 0.0], {}
         values["inverse"] = f"{1 / n[0] if n[0] else math.inf:.3g}"
         values["far"] = f"{1 / max(n[0] + n[1], 1e-6):.3g}"

@@ -64,8 +64,8 @@ class Diagnosis:
         best_px: median of what the best motion would leave.
         error_px: how far the data are from the best explanation, without the noise: right data are
             right to this many pixels.
-        rivals_px: what the data would leave, by what mends each mistake.
-        suspects: what mends the data, the likeliest first; none if they are right.
+        rivals_px: what the data would leave, by what corrects each mistake.
+        suspects: what corrects the data, the likeliest first; none if they are right.
         unseen: what may be needed, and would not show in these data.
         notes: further sentences: frames that stand out, and what could not be tested.
     """
@@ -134,21 +134,22 @@ def diagnosed(
         "suspects": tuple(typed for typed, _ in texts),
     }  # fmt: skip
     ways = " or ".join(
-        f"{says} ({remedy(typed, each.pairs)} would leave {median(each.beyond(noise)):.2g} px)"
+        f"{says} ({remedy(typed, each.pairs)} would reduce the error to "
+        f"{median(each.beyond(noise)):.2g} px)"
         for each, (typed, says) in zip(able, texts)
     )
-    size = f"{error:.2g} px of {max(raw_px, median(px_of(ego))):.2g} px"
+    size = f"{error:.2g} px (flow: {max(raw_px, median(px_of(ego))):.2g} px)"
     is_doubtful = pairs.is_estimated and best_px > _DOUBTFUL * raw_px + _DOUBTFUL_PX
     if is_doubtful and (not able or len(able[0].n)):  # to learn from such flow is no explanation
         why = f"flow estimated from the pictures fits no motion: {best_px:.2g} px are left"
         return Diagnosis("can't tell", why, **numbers)
     enough = max(2 * able[0].least, error / _SEVERAL) if able else 0.0
     if able and median(able[0].beyond(noise)) < enough and not able[0].is_unexplained:
-        return Diagnosis("wrong", f"{ways}; now {size} are left", **numbers)
+        return Diagnosis("wrong", f"{ways}; now it is {size}", **numbers)
     is_rough = error > _ROUGH * raw_px + _ROUGH_WIDTHS * width
     is_rough |= error > max(_TIMES_THE_NOISE * median(recorded.spread), _LITTLE * raw_px)
     if able or recorded.is_unexplained or (is_rough and error > least):
-        why = f"{size} are left, which none of {len(rivals)} known mistakes explains"
+        why = f"the error is {size}, and none of {len(rivals)} known mistakes explains it"
         why += f"; a motion exists that would leave {best_px:.2g} px" if pairs.has_poses else ""
         why += f"; nearest: {ways}" if able else ""
         return Diagnosis("something is wrong", why, **numbers)
@@ -163,12 +164,12 @@ def diagnosed(
     if not pairs.by_flow:
         hidden = median(pairs.K[:, 0, 0] * px_of(pairs.coarseness.unsqueeze(1), 0.5))
         error = numbers["error_px"] = max(error, hidden)
-        size = f"{error:.2g} px of {raw_px:.2g} px"
+        size = f"{error:.2g} px (flow: {raw_px:.2g} px)"
     steps = f"depth's steps of {pairs.depth_step:.2g} m hide"
     if error > _UNSURE * raw_px:
         why = f"{steps} errors of {size}: give flow, too"
         if not pairs.is_coarse:
-            why = f"{size} are left, by rough poses or a mistake that {len(errors)} pairs hide"
+            why = f"the error is {size}: rough poses, or a mistake that {len(errors)} pairs hide"
         return Diagnosis("can't tell", why, **numbers)
     why, of_depth = _about_depth(pairs, motion)
     if why:
@@ -449,7 +450,7 @@ def _off(pairs: Pairs, motion: Tensor, farthest: float) -> tuple[float, float]:
 
 
 def _unseen(pairs: Pairs, rivals: Sequence[Rival], least: float) -> tuple[str, ...]:
-    """Returns what mends the mistakes of a usual size that change nothing here."""
+    """Returns what corrects the mistakes of a usual size that change nothing here."""
     pairs, unseen = pairs.of(pixels=slice(fit.FITTED)), []
     now = residual(pairs, pairs.motion, plain=True)
     for rival in rivals:
@@ -470,7 +471,7 @@ def _mapped(pairs: Pairs, best: Tensor) -> Tensor:
     """Returns the errors of poses that are corrected as the other pairs tell, px `[P]`.
 
     Each motion is corrected by a linear function of it. Whatever distorts poses in one and the same
-    way, a convention that nobody listed too, is mended by it; noise of poses isn't.
+    way, a convention that nobody listed too, is corrected by it; noise of poses isn't.
     """
     recorded, wanted = fit.motion_vector(pairs.motion), fit.motion_vector(best)
     focal, inverse = pairs.K[:, 0, 0].median(), pairs.depth.reciprocal().nanmedian()

@@ -37,12 +37,12 @@ NOTES |= {name: "motions of bodies are not tested" for name in UNLISTED if name[
 KINDS = {  # what comes out of a cell, and what that means
     "right": "right data, called right",
     "named": "wrong, and the mistake is named",
-    "noticed": "something is wrong, or, of a mistake that no table lists, what would mend it",
+    "noticed": "something is wrong, or, of a mistake that no table lists, what would correct it",
     "another": "wrong, but another mistake is named",
     "can't tell": "can't tell",
-    "small": "right, to more pixels than the mistake adds",
-    "said": "right, with a note that says so, or that what mends the mistake would not show",
-    "passed": "**passed as right**",
+    "small": "called right; the mistake adds less than the error and the noise that are printed",
+    "said": "called right; a note says that such a mistake may be there, or would not show",
+    "passed": "**called right, without a word**",
     "false alarm": "**right data called wrong**",
 }
 
@@ -214,13 +214,16 @@ def table_of(page: str) -> dict[str, dict[str, str]]:
 
 
 def written(table: dict[str, dict[str, str]]) -> str:
-    """Returns the table as Markdown, and how often each kind came out."""
+    """Returns how often each kind came out, and the table as Markdown."""
     sources = [name for name in RECORDINGS | ENVS if any(name in row for row in table.values())]
     lines = [["mistake", *sources], ["---"] * (1 + len(sources))]
     lines += [[name, *(row.get(source, "") for source in sources)] for name, row in table.items()]
     counts = Counter(kind for row in table.values() for kind in row.values())
-    text = "".join(f"| {' | '.join(line)} |\n" for line in lines) + "\n"
-    return text + "".join(f"- {kind}: {counts[kind]} ({KINDS[kind]})\n" for kind in KINDS)
+    mistakes = sum(counts[kind] for kind in KINDS) - counts["right"] - counts["false alarm"]
+    as_right = sum(counts[kind] for kind in ("small", "said", "passed"))
+    text = f"Of {mistakes} mistakes, {as_right} are called right. The cells:\n\n"
+    text += "".join(f"- {kind}: {counts[kind]} ({KINDS[kind]})\n" for kind in KINDS)
+    return text + "\n" + "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def main(sources: list[str]) -> None:
