@@ -39,7 +39,7 @@ $(DEVELOPED): $(INSTALLED)
 
 install: $(INSTALLED)  ## Create .venv and install flowrep into it; without a GPU: make install INDEX=<PyTorch's CPU index>
 
-develop: $(DEVELOPED)  ## The same with what tests, lint and types need
+develop: $(DEVELOPED)  ## Install what tests, lint and types need, too
 
 train: $(INSTALLED)  ## Train and evaluate an agent on Straight Road: make train ARGS="seed=1"
 	$(BIN)/python -m flowrep.train preset=laptop $(ARGS)
@@ -47,7 +47,7 @@ train: $(INSTALLED)  ## Train and evaluate an agent on Straight Road: make train
 evaluate: $(INSTALLED)  ## Evaluate a run: make evaluate ARGS="run=outputs/..."
 	$(BIN)/python -m flowrep.evaluate $(ARGS)
 
-smoke: $(INSTALLED)  ## A whole run in seconds
+smoke: $(INSTALLED)  ## A whole run in about half a minute, too short to learn anything
 	$(BIN)/python -m flowrep.train debug=smoke $(ARGS)
 
 demo: $(INSTALLED)  ## A trained agent drives 20 episodes, the first as a film: make demo ARGS="scene=s_turn"
@@ -61,7 +61,7 @@ results: $(INSTALLED)  ## Make the page of results from the stored runs
 
 SCENES = straight_road s_turn h_shaped_pathways three_way_junction
 
-gallery: $(INSTALLED)  ## Make the README's gallery anew
+gallery: $(INSTALLED)  ## Redraw the pictures of the documentation
 	for scene in $(SCENES); do \
 	  $(BIN)/python -m flowrep.view scene=$$scene sheet_rows=2 video=false output=outputs/gallery/$$scene || exit 1; \
 	  cp outputs/gallery/$$scene/sheet.png docs/images/gallery_$$scene.png; \
@@ -76,7 +76,7 @@ PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses=auto --dist=lo
 test: $(DEVELOPED)  ## Run the tests
 	$(PYTEST) $(ARGS)
 
-test-fast: $(DEVELOPED)  ## Run those that take no more than a second or two
+test-fast: $(DEVELOPED)  ## Run the fast tests only
 	$(PYTEST) -m "not slow" $(ARGS)
 
 test-python:  ## Run the fast tests with the newest packages, on another Python: make test-python PYTHON=python3.14
@@ -100,7 +100,7 @@ lint: $(DEVELOPED)  ## Check style, formatting and spelling
 types: $(DEVELOPED)  ## Check types
 	$(BIN)/mypy
 
-format: $(DEVELOPED)  ## Mend style and formatting
+format: $(DEVELOPED)  ## Fix style and formatting
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 

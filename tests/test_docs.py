@@ -18,6 +18,7 @@ from torchrl.envs import TransformedEnv, check_env_specs
 
 from docs import docstrings
 from flowrep import transforms
+from flowrep.config import config_groups, group_choices
 from flowrep.config.cli import as_typed
 from flowrep.config.schema import (
     EvaluateConfig,
@@ -51,6 +52,19 @@ def navigation(entries):
 
 def python_of(page):
     return "\n".join(re.findall(r"```python\n(.*?)```", page.read_text("utf-8"), re.DOTALL))
+
+
+def test_the_page_of_configs_lists_every_group_and_choice():
+    rows = re.findall(r"^\| `(\w+)` \|([^|]*)\|", (DOCS / "configs.md").read_text("utf-8"), re.M)
+    listed = {group: sorted(re.findall(r"`(\w+)`", choices)) for group, choices in rows}
+    assert listed == {group: group_choices(group) for group in config_groups()}
+
+
+def test_the_list_of_examples_is_complete():
+    folder = DOCS.parent / "examples"
+    names = re.findall(r"^\| `([\w.]+)` \|", (folder / "README.md").read_text("utf-8"), re.M)
+    there = [path.name for path in folder.iterdir() if not path.name.startswith(("_", "README"))]
+    assert sorted(names) == sorted(there)
 
 
 def test_every_transform_has_its_page():

@@ -240,7 +240,7 @@ def explained(error: Exception, schema: type[Command]) -> str:
 
 def _needed(key: str, schema: type[Command]) -> str:
     """Returns the line for a key without a value, with the example at the top of conf/<command>."""
-    example = (CONF_DIR / f"{_name(schema)}.yaml").read_text("utf-8").partition("\n")[0]
+    _, example, *_ = (CONF_DIR / f"{_name(schema)}.yaml").read_text("utf-8").splitlines()
     return f"{key} needs a value, for example: {example.removeprefix('# ')}"
 
 
@@ -263,20 +263,25 @@ def _unknown_key(key: str, schema: type[Command]) -> str:
 
 
 def _show_if_asked(arguments: Sequence[str], config_name: str) -> None:
-    """Ends the process after --version or --help, which prints the keys and comments of conf/."""
+    """Ends the process after --version or --help, which prints conf/ without Hydra's lines."""
     if "--version" in arguments:
         print(f"flowrep {__version__}")
         sys.exit(0)
     if not {"--help", "-h"} & {*arguments}:
         return
     text = (CONF_DIR / f"{config_name}.yaml").read_text(encoding="utf-8")
+    groups = [name for name in config_groups() if re.search(rf"(?m)^ +- {name}:", text)]
+    text = re.sub(r"(?m)^ +- (_self_|override|optional|run_folder).*\n", "", text)
+    if not groups:
+        text = text.replace("defaults:\n", "")
     print(text.partition("\nhydra:")[0].rstrip())
-    print("\nChoices of the groups:")
-    for group in config_groups():
-        if re.search(rf"^ +- (optional )?{group}:", text, re.MULTILINE):
-            print(f"  {group}: {', '.join(group_choices(group))}")
+    if groups:
+        print("\nChoices of the groups:")
+    for group in groups:
+        print(f"  {group}: {', '.join(group_choices(group))}")
     print("\nkey=value sets a key, group=choice chooses, -m runs each of several values.")
-    print("--cfg job shows the resulting config, --hydra-help lists Hydra's own flags.")
+    print("--cfg job shows the resulting config with all keys of its groups.")
+    print("--hydra-help lists Hydra's own flags.")
     sys.exit(0)
 
 

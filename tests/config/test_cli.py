@@ -1,6 +1,7 @@
 """A mistake ends in `error:` lines and code 2; odd names pass through shell and Hydra unharmed."""
 
 import random
+import re
 import shlex
 import shutil
 import sys
@@ -22,6 +23,7 @@ SCHEMAS = {
     "factorize": schema.FactorizeConfig,
     "report": schema.ReportConfig,
     "view": schema.ViewConfig,
+    "export": schema.ExportConfig,
 }
 
 
@@ -150,8 +152,24 @@ def test_help_has_the_comments_of_conf_and_the_choices(run):
     assert code == 0
     assert "environment steps" in said.out
     assert "laptop_long" in said.out
+    assert not any(word in said.out for word in ("_self_", "override hydra", "run_folder"))
     _, _, said = run("train", "--version")
     assert said.out == f"flowrep {flowrep.__version__}\n"
+
+
+@pytest.mark.parametrize("command", SCHEMAS)
+def test_help_begins_with_what_the_command_does(run, command):
+    _, _, said = run(command, "--help")
+    sentence, example = said.out.splitlines()[:2]
+    assert re.fullmatch(r"# [A-Z].*\.", sentence)
+    assert example.startswith(f"# python -m flowrep.{command} ")
+
+
+def test_help_lists_no_groups_for_a_command_without_any(run):
+    _, _, said = run("report", "--help")
+    assert "trajectories" in said.out
+    assert "groups:" not in said.out
+    assert "defaults:" not in said.out
 
 
 @pytest.mark.parametrize("form", ["hydra.searchpath=[pkg://mypkg]", "--config-dir"])
