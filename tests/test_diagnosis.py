@@ -18,8 +18,9 @@ from tensordict import TensorDict
 
 pytest.importorskip("cv2", reason="recordings need OpenCV")
 
-from flowrep import diagnose, geometry
+from flowrep import diagnose, diagnosis, geometry, transforms
 from flowrep.diagnosis import Examination
+from flowrep.diagnosis.rivals import rivals_of
 from flowrep.geometry.pose import rotation_from_vector
 from tests.injected import matrix, mistakes
 from tests.injected.sources import (
@@ -420,6 +421,21 @@ def test_what_transforms_wrote_is_computed_again(frames):
     scaled = spoilt(frames, obj=lambda flow: 8 * flow)  # by its scale
     assert scaled.is_right
     assert "8 times" in scaled.notes[0]
+
+
+def test_every_adapter_that_is_printed_for_an_env_can_be_made():
+    adapters = (transforms.AdaptDepth, transforms.AdaptFlow, transforms.AdaptPose)
+    names = {adapter.__name__: adapter for adapter in adapters} | {"K": torch.eye(3)}
+    rivals = rivals_of({}, by_flow=True, of_flow=True, absolute=True)
+    texts = [rival.texts(torch.tensor(rival.start[0]), width=64)[0] for rival in rivals]
+    calls = {text: diagnosis.envs._call(text, None) for text in texts}
+    made = [eval(call, names) for call in calls.values() if call.startswith("Adapt")]
+    assert {*map(type, made)} == {*adapters}
+    # two options of one pose are arguments of one transform, or it would be converted twice
+    both = "pose_direction=world_to_camera pose_axes=opengl"
+    assert calls[both] == 'AdaptPose(direction="world_to_camera", axes="opengl")'
+    assert "near_m=0.2" in calls["depth_kind=z_buffer near_m=0.2 far_m=1e+06"]
+    assert calls["pose_lag_frames=1"] == "pose_lag_frames=1"
 
 
 def test_flow_that_was_measured_is_a_witness_of_its_own(frames):

@@ -15,6 +15,7 @@ from flowrep import geometry
 from flowrep.diagnosis.fit import (
     EYE,
     INTERPOLATED_PX,
+    Pairs,
     best_motion,
     median,
     px_of,
@@ -32,6 +33,12 @@ _FEW_FRAMES = 3  # of a body
 _MUCH = 0.2  # of the picture: id 0 is then the static world, if no motions tell
 _ROUND = 0.05  # of a body's flow: depth between pixels is less exact where bodies are round
 _SAME_PX, _SAME_SHARE = 0.02, 0.01  # of flow that was computed twice
+_ADAPTERS = {
+    "pose_layout": "AdaptPose", "pose_direction": "AdaptPose", "pose_axes": "AdaptPose",
+    "depth_kind": "AdaptDepth", "near_m": "AdaptDepth", "far_m": "AdaptDepth",
+    "flow_direction": "AdaptFlow", "flow_channels": "AdaptFlow",
+}  # fmt: skip
+"""Options of recordings, and the transform that has each as an argument."""
 
 
 @torch.no_grad()
@@ -273,10 +280,18 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[str, str]:
     return "", ""
 
 
-def _call(typed: str, corrected: Any) -> str:
-    """Returns the transform that an option is one of."""
-    transforms = {"pose": "AdaptPose", "depth": "AdaptDepth", "flow": "AdaptFlow"}
-    keys = {"direction", "axes", "layout", "kind", "channels"}
-    options = [option.replace("=", "_").split("_", 2) for option in typed.split(" ")]
-    calls = [f'{transforms[o[0]]}({o[1]}="{o[2]}")' for o in options if len(o) > 2 and o[1] in keys]
-    return " ".join(calls) or typed
+def _call(typed: str, _: Pairs) -> str:
+    """Returns the call of the adapter that has these options; other texts are unchanged."""
+    options = dict(option.partition("=")[::2] for option in typed.split(" "))
+    if not options.keys() <= _ADAPTERS.keys():
+        return typed
+    adapter = _ADAPTERS[next(iter(options))]
+    if adapter == "AdaptFlow":  # it has no defaults
+        options = {"flow_direction": "forward", "flow_grid": "current"} | options
+    arguments = [
+        f"{key}={value}" if key.endswith("_m") else f'{key.partition("_")[2]}="{value}"'
+        for key, value in options.items()
+    ]
+    if options.get("depth_kind") == "ray_length":
+        arguments.append("intrinsics=K")
+    return f"{adapter}({', '.join(arguments)})"

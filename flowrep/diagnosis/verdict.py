@@ -492,8 +492,8 @@ def _mapped(pairs: Pairs, best: Tensor) -> Tensor:
 def _smoothed(pairs: Pairs, best: Tensor) -> Tensor:
     """Returns what the best motion leaves without its structure over picture and depth, px `[P]`.
 
-    A polynomial of the pixel's pixel and inverse depth, fitted to every other block of the picture,
-    is subtracted in the others. Where K, depth and flow fit each other, noise alone is left.
+    A polynomial in the pixel's position and inverse depth is fitted to every other block of the
+    picture and subtracted in the others. Where K, depth and flow fit, only noise is left.
     """
     left, (height, width) = residual(pairs, best), pairs.now.shape[-2:]
     x, y = (2 * pairs.pixel.nan_to_num() / torch.tensor([[width], [height]]) - 1).unbind(1)
