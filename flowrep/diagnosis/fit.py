@@ -16,13 +16,13 @@ from flowrep.geometry.pose import relative_motion, rotation_from_vector
 EYE = torch.eye(4, dtype=torch.float64)
 PIXELS, FITTED = 1000, 400  # of a pair, and of these, those that motions and numbers are fitted to
 _LEAST_TEXTURE = 0.25  # of a structure tensor's trace, 0 to 2
-_BEHIND_PX = 1e3  # left of a point that a motion puts behind the camera
+_BEHIND_PX = 1e3  # residual of a point that a motion puts behind the camera
 _STEP = 1e-6  # of numeric derivatives
-# Depth between pixels is exact on planes alone: round bodies leave 0.02 px of right data.
+# Interpolated depth is exact on planes only: on round bodies, right data have residuals of 0.02 px.
 INTERPOLATED_PX = 0.04
 PARTS = 6, 4  # columns and rows of a picture, in which noise evens out and bodies don't
-_DEARER = 5.0  # one pixel that stops agreeing counts as much as this many that begin to
-_SETTLED = 0.01  # a step that is too small to matter, in scales of all pixels' root of squares
+_DEARER = 5.0  # weight of a pixel that no longer agrees, relative to one that begins to agree
+_SETTLED = 0.01  # a smaller step ends the descent; in scales, by which it moves all pixels together
 
 
 class Pairs(NamedTuple):
@@ -149,8 +149,8 @@ def homogeneous(points: Tensor) -> Tensor:
 def residual(pairs: Pairs, motion: Tensor, *, plain: bool = False) -> Tensor:
     """Returns what a motion `[..., P, 4, 4]` leaves, px `[..., P, 2 or 1, N]`, nan where unknown.
 
-    Of flow, along the directions that have texture unless `plain`. Of depth, beyond its steps, how
-    far a surface at 45 degrees would have to move to be as near as the frame before shows it.
+    With flow, only directions that have texture count, unless `plain`. With depth, it is how far a
+    surface at 45 degrees would have to move to explain the difference, less the depth's step.
     """
     pixel, ratio = seen_before(pairs, motion)
     known = ~pairs.depth.isnan() & motion.isfinite().flatten(-2).all(-1, keepdim=True)
@@ -182,15 +182,16 @@ def looked_up(maps: Tensor, pixel: Tensor, mode: str = "bilinear") -> Tensor:
 def px_of(left: Tensor, share: float | None = None) -> Tensor:
     """Returns a quantile of each pair's lengths of what is left, `[..., P, C, N]`.
 
-    Of flow the median, since half of the picture may move by itself. Of depth, of what is known to
-    stand still, 0.8: roads and walls along the way are as far wherever the camera is on them.
+    With flow, it is the median, since half of the picture may move by itself. With depth, of which
+    only static pixels are given, it is the 0.8 quantile: along a road or a wall, most depths stay
+    the same wherever the camera is, so the median would be near 0 for wrong motions, too.
     """
     share = share or (0.5 if left.shape[-2] == 2 else 0.8)
     return left.square().sum(-2).sqrt().nanquantile(share, -1, interpolation="lower")
 
 
 def spread_of(left: Tensor) -> Tensor:
-    """Returns the median of what is left as noise alone would make it, by its lower third."""
+    """Returns the median that residuals of noise alone would have, by their lower third."""
     if left.shape[-2] == 1:
         return px_of(left)
     return math.sqrt(math.log(2) / math.log(1.5)) * px_of(left, 1 / 3)
@@ -237,7 +238,7 @@ def descended(
 ) -> tuple[Tensor, Tensor]:
     """Returns motions, and the numbers `[G, k]` of a change, that leave less: Gauss-Newton steps.
 
-    Weights are Geman and McClure's. Without `motion` those are kept that are recorded.
+    Weights are Geman and McClure's. Without `motion`, the recorded motions are kept.
 
     Args:
         group: `[P]`, the row of n that is a pair's.
@@ -290,7 +291,7 @@ def best_motion(pairs: Pairs, *starts: Tensor, steps: int = 5) -> Tensor:
     """Returns the motions that leave least, from whichever start each is reached."""
     few, motions = pairs.of(pixels=slice(FITTED)), [*starts]
     nothing, nobody = torch.zeros(1, 0).double(), torch.zeros(len(few.K), dtype=torch.long)
-    # Edges of depth first tell the way, and then, being interpolated, don't count any more.
+    # Edges of depth show the direction in the first round; interpolated, they don't count later.
     rounds = [few] if pairs.by_flow else [few, few._replace(scale_px=INTERPOLATED_PX)]
     for end in starts:
         for each in rounds:
@@ -306,7 +307,7 @@ def least_costly(pairs: Pairs, motions: Tensor) -> Tensor:
 
 
 def fits_a_crowd(pairs: Pairs, left: Tensor) -> Tensor:
-    """Returns in which pairs `[P]` what leaves `left` gives up pixels that recorded motion fits.
+    """Returns in which pairs `[P]` a motion with residuals `left` gives up what the recorded fits.
 
     Where much of the picture moves, another motion may fit more pixels than the right one. It gives
     up those that the right one fits, in whole parts of the picture. What corrects a wrong motion
@@ -321,7 +322,7 @@ def fits_a_crowd(pairs: Pairs, left: Tensor) -> Tensor:
 
 
 def agreement(pairs: Pairs, left: Tensor) -> Tensor:
-    """Returns how much pixels agree with M motions that leave `[M, P, C, N]`, 0 to 1, `[M, P, N]`.
+    """Returns the agreement `[M, P, N]`, 0 to 1, with M motions of residuals `[M, P, C, N]`.
 
     By depth alone, neither an interpolated edge nor a pixel that the first motion moves out of the
     picture is a reason to leave the first.

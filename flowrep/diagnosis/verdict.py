@@ -25,18 +25,18 @@ from flowrep.diagnosis.fit import (
 )
 from flowrep.diagnosis.rivals import Rival
 
-# Smaller errors are none: rounding, a share of the noise, and of estimated flow, which is too
-# short.
+# Smaller errors don't count: rounding in pixels, a share of the noise, and a share of estimated
+# flow, which is too short.
 _EXACT_PX, _OF_NOISE, _OF_ESTIMATED = 2e-3, 0.3, 0.03
 # What explains an error leaves several times less, or clearly less in most of many pairs.
 _SEVERAL, _CLEARLY, _MANY_PAIRS = 3.0, 1.7, 8
 _STRUCTURED = 0.1  # of raw flow: more structure than an estimator's own
 # Shares of raw flow. Noise of poses reaches `_ROUGH` and a number of pixels that grows with the
 # picture, unless the flow is nearly free of noise.
-_LARGE = 0.04  # errors that may be explained if something leaves clearly less, not several times
+_LARGE = 0.04  # above it, clearly smaller residuals explain an error; below, several times smaller
 _EXPLAINED = 0.25  # what an explanation leaves at most
 _ROUGH, _ROUGH_WIDTHS, _TIMES_THE_NOISE, _LITTLE = 0.25, 1 / 1280, 20.0, 0.02
-_UNSURE = 0.15  # right data would be right to that alone
+_UNSURE = 0.15  # beyond it, even "right" would be too inaccurate to be of use
 _DOUBTFUL, _DOUBTFUL_PX = 0.15, 0.15  # left by the best motion: the flow's estimator failed
 # A stray pair errs by more than `_STRAY` times the median and `_STRAY_SHARE` of its flow. If
 # `_MANY_STRAYS` of all pairs are stray, a part of the recording is wrong.
@@ -62,11 +62,11 @@ class Diagnosis:
         raw_px: median length of flow.
         left_px: median of what the recorded data leave, |raw - ego| where flow is the witness.
         best_px: median of what the best motion would leave.
-        error_px: how far the data are from the best explanation, without the noise: right data are
-            right to this many pixels.
-        rivals_px: what the data would leave, by what corrects each mistake.
+        error_px: the error of the recorded motion, without the noise. If the verdict is "right",
+            the conventions are right to this many pixels.
+        rivals_px: the residual after each correction, by correction.
         suspects: what corrects the data, the likeliest first; none if they are right.
-        unseen: what may be needed, and would not show in these data.
+        unseen: corrections that these data can neither confirm nor rule out.
         notes: further sentences: frames that stand out, and what could not be tested.
     """
 
@@ -307,7 +307,7 @@ def _explanations(
         if not has_poses:
             motion = best_motion(changed, still, motion)
         elif rival.of != "poses":
-            # Beside poses, what leaves more than the data do is no explanation.
+            # Except for poses, a correction with larger residuals than the data is no explanation.
             few_left = residual(changed.of(pixels=slice(fit.FITTED)), changed.motion)
             if not median(px_of(few_left)) <= left:
                 continue
@@ -382,7 +382,7 @@ def _able(others: Sequence[_Fit], before: Tensor, noise: Tensor, raw_px: float) 
         return []
     enough = min(_CLEARLY * after[able[0]] + able[0].floor, error / _CLEARLY)
     able = [each for each in ranked if after[each] <= enough]
-    # One that learns more numbers than another of its kind says the same with more words.
+    # Of several corrections of one kind, the one with the fewest fitted numbers is kept.
     fewest = {each.rival.of: len(each.n) for each in sorted(able, key=lambda e: -len(e.n))}
     return [each for each in able if len(each.n) == fewest[each.rival.of]]
 
@@ -450,7 +450,7 @@ def _off(pairs: Pairs, motion: Tensor, farthest: float) -> tuple[float, float]:
 
 
 def _unseen(pairs: Pairs, rivals: Sequence[Rival], least: float) -> tuple[str, ...]:
-    """Returns what corrects the mistakes of a usual size that change nothing here."""
+    """Returns the corrections whose usual mistake would not change the residuals here."""
     pairs, unseen = pairs.of(pixels=slice(fit.FITTED)), []
     now = residual(pairs, pairs.motion, plain=True)
     for rival in rivals:
