@@ -109,7 +109,7 @@ class Examination:
 
 
 def why_not(pairs: Pairs) -> list[str]:
-    """Returns why each pair can't be tested, "" if it can, `STANDS` if depth denies a standstill."""
+    """Returns why a pair can't be tested, "" if it can, `STANDS` if depth denies a standstill."""
     ego = px_of(pairs.pixel - seen_before(pairs, pairs.motion)[0]).nan_to_num(0.0)
     moves = torch.maximum(px_of(pairs.raw).nan_to_num(0.0), ego) >= _LEAST_MOVEMENT_PX
     number, has_depth = (~pairs.depth.isnan()).sum(-1), pairs.now.isfinite().flatten(1).any(1)
