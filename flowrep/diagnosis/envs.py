@@ -276,7 +276,7 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[str, str]:
             return "fault", why
     # A flat body that moves aside changes no depth: it might as well be at rest.
     if int((at_rest_px > least).sum()) < _FEW_FRAMES:
-        return "untested", "the bodies' depth hardly changes, so their motions are not tested"
+        return "untested", "depth hardly shows how bodies move: motions of bodies are not tested"
     return "", ""
 
 
