@@ -1,4 +1,4 @@
-"""How well can a street be driven with some maps, if exploring is not the problem?
+"""How well can Straight Road be driven with some maps, if exploring is not the problem?
 
 A teacher, a Q-function on the simulator's state, is trained without pictures and kept in a file. A
 student on maps then drives by its own actions and learns the teacher's values of the frames it
@@ -151,8 +151,7 @@ def distil(
     optimizer = torch.optim.Adam(student.parameters(), 3e-4, fused=True)
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, frames // NUM_ENVS)
     memory = TensorDictReplayBuffer(storage=LazyTensorStorage(50_000), batch_size=128)
-    if scene.symmetric:
-        memory.append_transform(make_mirror(scene, maps))
+    memory.append_transform(make_mirror(scene, maps))
     seen = env.reset()
     with closing(env), trange(frames // NUM_ENVS, desc="student") as bar:
         for _ in bar:
@@ -193,7 +192,6 @@ def success(
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--maps", nargs="+", default=["ego", "obj"])
-    parser.add_argument("--scene", default="straight_road", help="straight, for mirrored states")
     parser.add_argument("--size", type=int, default=60, help="of the maps, pixels")
     parser.add_argument("--speed", nargs=2, type=float, default=[0.6, 2.4], help="m/s")
     parser.add_argument("--frames", type=int, default=100_000)
@@ -204,7 +202,7 @@ if __name__ == "__main__":
     args = parser.parse_args()
     keep_freed_memory()
     torch.set_num_threads(1)
-    scene = load_scene(args.scene)
+    scene = load_scene("straight_road")  # its mirror image is itself, which `values` relies on
     camera = replace(scene.camera, height_px=args.size, width_px=args.size)
     scene = replace(scene, camera=camera)
     if args.teacher.exists():
