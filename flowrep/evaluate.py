@@ -131,7 +131,7 @@ def evaluate_one(
                 folder.log_episodes(records, drives=True)
                 folder.write_failures()
             except OSError as error:
-                raise OSError(f"{folder.path}: {error}. After that, evaluate again") from error
+                raise OSError(f"{folder.path}: {error}; then evaluate again") from error
             print(folder.path)
             print_results([record.row() for record in records])
             print(f"{len(records)} of {evaluation.total} episodes are in {folder.evaluation_path}")

@@ -22,7 +22,7 @@ _STEP = 1e-6  # of numeric derivatives
 INTERPOLATED_PX = 0.04
 PARTS = 6, 4  # columns and rows of a picture, in which noise evens out and bodies don't
 _DEARER = 5.0  # weight of a pixel that no longer agrees, relative to one that begins to agree
-_SETTLED = 0.01  # a smaller step ends the descent; in scales, by which it moves all pixels together
+_SETTLED = 0.01  # a smaller step ends the descent: root of all pixels' squares, in scales
 
 
 class Pairs(NamedTuple):
