@@ -200,6 +200,8 @@ def test_pictures_and_estimator_have_one_scale_however_flow_is_named(make):
     for flow in ("estimated", {"source": "estimated"}, {"source": "estimated", "picture_scale": 2}):
         env = make(representations=["raw"], flow=flow, picture_scale=2, seed=0)
         assert env.reset()["raw"].shape == (1, 2, 84, 84)  # rival: that of the pictures, 168
+        (street,) = street_envs(env)
+        assert street.observation_space["rgb"].shape == (3, 168, 168)
 
 
 def test_options_of_a_representation_reach_its_transform(make):
