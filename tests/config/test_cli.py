@@ -63,7 +63,6 @@ MISTAKES = [
     ("train representations=[]", ["representations"]),
     ("train ~algorithm", ["preset"]),
     ("train total_frames=???", ["total_frames"]),
-    ("factorize input=x output=y format=sintel", ["format.scene"]),
     ("report", ["run", "python -m flowrep.report outputs/"]),
     ("factorize", ["format", "sevenscenes", "python -m flowrep.factorize input=<folder>"]),
     ("factorize format=tum", ["input", "python -m flowrep.factorize input=<folder>"]),
