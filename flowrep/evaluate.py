@@ -17,10 +17,10 @@ from flowrep.extras import require
 
 require("evaluation", "train", "hydra", "pydantic", module=__name__)
 
-from flowrep.config import UsageError
 from flowrep.config.cli import EXIT_USAGE, folder_name, is_a_mistake, print_error, run_command
 from flowrep.config.schema import EvaluateConfig, check_policy
-from flowrep.progress import StopRequest
+from flowrep.stop import StopRequest
+from flowrep.usage import UsageError
 
 if TYPE_CHECKING:
     from flowrep.experiment.agents import Agent

@@ -21,9 +21,9 @@ require(
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import get_class
 
-from flowrep.config import UsageError
 from flowrep.config.cli import run_command
 from flowrep.config.schema import FactorizeConfig, check_reader_options
+from flowrep.usage import UsageError
 
 if TYPE_CHECKING:
     from flowrep import sequences

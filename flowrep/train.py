@@ -19,13 +19,13 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
-from flowrep.config import UsageError
 from flowrep.config.cli import OF_THE_MACHINE, checked, end_with, exit_with, line_for, run_command
 from flowrep.config.schema import TrainConfig
 from flowrep.experiment import sweep
 from flowrep.experiment.outcomes import is_finished, success_of
 from flowrep.options import ALGORITHMS
-from flowrep.progress import StopRequest
+from flowrep.stop import StopRequest
+from flowrep.usage import UsageError
 
 if TYPE_CHECKING:
     from flowrep.experiment.run import RunFolder

@@ -20,13 +20,13 @@ require("viewing", "train", "hydra", "pydantic", module=__name__)
 import numpy as np
 from hydra.core.hydra_config import HydraConfig
 
-from flowrep.config import UsageError
 from flowrep.config.cli import folder_name, run_command
 from flowrep.config.schema import ViewConfig, check_policy, policy_kind
 from flowrep.files import replace_files
 from flowrep.progress import progress_bar
 from flowrep.scenes.scene import CATEGORY_ID
 from flowrep.tables import write_rows
+from flowrep.usage import UsageError
 from flowrep.viz import contact_sheet, write_png, write_video
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def agent_of(config: ViewConfig, is_scene_given: bool) -> Agent:
 
 def street_of(config: ViewConfig) -> dict[str, Any]:
     """Returns what the config asks of the agent's env."""
-    return {"speed": config.speed, "frame_rate_hz": config.frame_rate_hz}
+    return {"speed": config.speed, "frame_rate_hz": config.fps}
 
 
 def folder_of(config: ViewConfig, scene: Scene) -> Path:

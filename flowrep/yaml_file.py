@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 import yaml
+
+from flowrep.usage import UsageError
 
 _OURS = Path(__file__).resolve().parent / "conf"
 # In a checkout it is a link to the one beside the package, for `pkg://flowrep.conf`; git makes none
@@ -15,10 +15,6 @@ _OURS = Path(__file__).resolve().parent / "conf"
 CONF_DIR = (_OURS if _OURS.is_dir() else _OURS.parents[1] / "conf").resolve()
 MAX_NODES = 100_000
 """Most values of a file with its aliases expanded; flowrep's scenes have fewer than 1,000."""
-
-
-class UsageError(ValueError):
-    """A mistake of the user; the message is all that one needs to read."""
 
 
 class _Loader(yaml.SafeLoader):
@@ -81,14 +77,3 @@ def read_yaml(path: str | Path) -> Any:
     # The last two are PyYAML's at `!!bool x` and `!!timestamp x`.
     except (OSError, ValueError, yaml.YAMLError, KeyError, AttributeError) as error:
         raise UsageError(f"{path}: can't be read: {' '.join(str(error).split())}") from error
-
-
-def closest_first(name: str, choices: Iterable[str]) -> str:
-    """Returns choices as text, sorted, but those that look like a misspelt name first.
-
-    >>> closest_first("strait_road", ["h_shaped_pathways", "s_turn", "straight_road"])
-    'straight_road, h_shaped_pathways, s_turn'
-    """
-    there = sorted(choices)
-    near = get_close_matches(name, there)
-    return ", ".join([*near, *(choice for choice in there if choice not in near)])

@@ -18,26 +18,28 @@ FLOWREP_IMPORTS_ALLOWED = {
     "diagnosis": {"diagnosis", "geometry"},
     "agent": {"agent", "extras", "files", "options"},
     "files": set(),
-    "scenes": {"scenes", "yaml_file", "extras", "choices"},
+    "scenes": {"scenes", "yaml_file", "usage", "extras", "choices"},
     "simulator": {"simulator", "scenes", "extras", "choices"},
     "envs": {"envs", "simulator", "scenes", "transforms", "geometry", "extras"}
-    | {"progress", "choices"},
+    | {"stop", "choices"},
     "pybullet": {"simulator", "extras"},
     "baselines": {"baselines", "envs", "scenes"},
     "experiment": {"experiment", "baselines", "envs", "simulator", "scenes", "agent"}
-    | {"transforms", "geometry", "progress", "tables", "config", "extras", "viz"}
-    | {"files", "options", "yaml_file"},
+    | {"transforms", "geometry", "progress", "stop", "tables", "config", "extras", "viz"}
+    | {"files", "options", "yaml_file", "usage"},
     "progress": set(),
+    "stop": set(),
+    "usage": set(),
     "tables": {"files"},
     "viz": {"viz", "scenes", "geometry", "files"},
-    "sequences": {"sequences", "config", "progress", "tables", "extras"}
+    "sequences": {"sequences", "config", "progress", "stop", "usage", "tables", "extras"}
     | {"transforms", "geometry", "viz", "diagnosis"},
-    "config": {"config", "choices", "options", "scenes", "yaml_file"},
+    "config": {"config", "choices", "options", "scenes", "yaml_file", "usage"},
     "choices": set(),
     "options": set(),
-    "yaml_file": set(),
+    "yaml_file": {"usage"},
     "report": {"report", "viz", "config", "experiment", "agent", "envs", "scenes"}
-    | {"extras", "tables", "files", "choices"},
+    | {"extras", "tables", "files", "choices", "usage"},
 }
 THIRD_PARTY_ONLY_IN = {
     "pybullet": {"simulator/bullet.py", "pybullet.py"},

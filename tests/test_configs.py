@@ -9,9 +9,10 @@ from unittest.mock import Mock
 import pytest
 import torch
 
-from flowrep.config import CONF_DIR, UsageError, config_groups, group_choices
+from flowrep.config import CONF_DIR, config_groups, group_choices
 from flowrep.config.schema import TrainConfig, validated
 from flowrep.options import NoiseOptions, RepresentationOptions
+from flowrep.usage import UsageError
 from tests.config.composing import composed, plain
 
 pytest.importorskip("pybullet", reason="composed configs are built into environments")

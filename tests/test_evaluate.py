@@ -13,7 +13,6 @@ import torch
 pytest.importorskip("pybullet", reason="agents are evaluated in the simulated street")
 
 from flowrep.agent import CheckpointError
-from flowrep.config import UsageError
 from flowrep.config.schema import EvaluateConfig, validated
 from flowrep.envs import WorkerError, workers
 from flowrep.evaluate import candidates_of
@@ -25,6 +24,7 @@ from flowrep.experiment.external import PolicyError
 from flowrep.experiment.run import RunFolder
 from flowrep.experiment.runner import Runner
 from flowrep.tables import TableError, read_rows
+from flowrep.usage import UsageError
 from tests.config.composing import composed, plain
 
 pytestmark = pytest.mark.slow

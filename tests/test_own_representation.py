@@ -9,13 +9,13 @@ import torch
 
 pytest.importorskip("pybullet", reason="the environments are built with it")
 
-from flowrep.config import UsageError
 from flowrep.config.schema import EvaluateConfig, ExportConfig, ViewConfig, validated
 from flowrep.experiment import build
 from flowrep.experiment.agents import Agent
 from flowrep.experiment.film import Film
 from flowrep.experiment.run import RunFolder
 from flowrep.train import resumed
+from flowrep.usage import UsageError
 from tests.config.composing import composed, plain
 from tests.running import ENVIRONMENT, ROOT, run_python
 

@@ -11,7 +11,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from flowrep.progress import Every, StopRequest, progress_bar
+from flowrep.progress import progress_bar
+from flowrep.stop import StopRequest
 from tests.running import run_python
 
 
@@ -55,17 +56,6 @@ def test_the_previous_handlers_come_back():
     with StopRequest():
         assert signal.getsignal(signal.SIGTERM) is not before
     assert signal.getsignal(signal.SIGTERM) is before
-
-
-def test_every_fires_once_for_each_multiple_that_a_jump_passes():
-    every = Every(100)
-    assert [step for step in range(0, 257, 32) if every(step)] == [128, 224]
-    assert not any(map(Every(0), range(5)))
-
-
-def test_every_continues_after_a_resume_without_firing_again():
-    assert not Every(100, last=130)(150)
-    assert Every(100, last=130)(201)
 
 
 # What a bar writes, to a terminal and to a file.
@@ -167,7 +157,8 @@ def test_in_a_terminal_it_is_a_bar_that_is_drawn_again_in_place():
 HANGS_UP = """
 import sys, time
 from pathlib import Path
-from flowrep.progress import StopRequest, progress_bar
+from flowrep.progress import progress_bar
+from flowrep.stop import StopRequest
 
 with StopRequest() as stop, progress_bar(what="x", total=9, mininterval=0, miniters=0) as bar:
     print("ready", flush=True)

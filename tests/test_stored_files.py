@@ -16,7 +16,6 @@ from safetensors.torch import save_file
 pytest.importorskip("pybullet", reason="the commands build the simulated street")
 
 from flowrep.agent import CheckpointError, checkpoint, load_checkpoint, save_checkpoint
-from flowrep.config import UsageError
 from flowrep.config.schema import EvaluateConfig, ExportConfig, ViewConfig, validated
 from flowrep.evaluate import candidates_of
 from flowrep.experiment import agents, film, sweep
@@ -26,6 +25,7 @@ from flowrep.experiment.run import RunFolder
 from flowrep.export import run as export
 from flowrep.scenes import SceneError, load_scene
 from flowrep.train import resumed
+from flowrep.usage import UsageError
 from flowrep.view import agent_of
 from tests.config.composing import composed, plain
 from tests.experiment.test_run import episode

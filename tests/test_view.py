@@ -13,13 +13,13 @@ from tensordict import TensorDict
 
 pytest.importorskip("pybullet", reason="the command needs the simulator")
 
-from flowrep.config import UsageError
 from flowrep.config.schema import ViewConfig, validated
 from flowrep.experiment.agents import Agent
 from flowrep.experiment.film import LEGEND_S, Film
 from flowrep.experiment.window import Keyboard, drive_by_hand
 from flowrep.scenes import load_scene
 from flowrep.tables import read_rows
+from flowrep.usage import UsageError
 from flowrep.view import (
     FILES,
     agent_of,

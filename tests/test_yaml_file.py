@@ -2,7 +2,7 @@
 
 import pytest
 
-from flowrep.config import UsageError
+from flowrep.usage import UsageError
 from flowrep.yaml_file import read_yaml
 
 # Each list holds the one before twice: 2 ** 17 - 1 values and lists in line 16.

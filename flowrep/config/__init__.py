@@ -1,8 +1,8 @@
 """The commands' configs: their files, their schema (`schema`) and their command lines (`cli`)."""
 
-from flowrep.yaml_file import CONF_DIR, UsageError, closest_first
+from flowrep.yaml_file import CONF_DIR
 
-__all__ = ["CONF_DIR", "UsageError", "closest_first", "config_groups", "group_choices"]
+__all__ = ["CONF_DIR", "config_groups", "group_choices"]
 
 
 def group_choices(group: str) -> list[str]:

@@ -34,8 +34,9 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from yaml import YAMLError
 
 from flowrep import __version__
-from flowrep.config import CONF_DIR, UsageError, closest_first, config_groups, group_choices
+from flowrep.config import CONF_DIR, config_groups, group_choices
 from flowrep.config.schema import Command, TrainConfig, validated
+from flowrep.usage import UsageError, closest_first
 
 EXIT_USAGE = 2
 FOLDERS = ("resume", "run", "input", "output", "hydra.run.dir", "hydra.sweep.dir")

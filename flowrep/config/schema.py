@@ -26,7 +26,6 @@ from pydantic import (
 )
 
 from flowrep.choices import FRAME_RATES_HZ, BaselineName, Renderer, SpeedMode
-from flowrep.config import UsageError
 from flowrep.options import (
     ALGORITHMS,
     CLASS,
@@ -40,6 +39,7 @@ from flowrep.options import (
     RepresentationOptions,
     Text,
 )
+from flowrep.usage import UsageError
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -335,7 +335,7 @@ class ViewConfig(Command):
     policy: Text
     algorithm: Trusted
     speed: SpeedMode
-    frame_rate_hz: FrameRate | None
+    fps: FrameRate | None
     path: Text | None
     output: Text | None
     seed: Seed

@@ -13,7 +13,6 @@ from torch import Tensor
 from torchrl.data import Composite
 
 from flowrep.agent import CheckpointError, load_checkpoint, save_checkpoint, torch_threads
-from flowrep.config import UsageError, closest_first
 from flowrep.config.cli import composed
 from flowrep.config.schema import (
     EnvConfig,
@@ -39,9 +38,10 @@ from flowrep.experiment.external import Task, check_card, load_policy
 from flowrep.experiment.outcomes import EpisodeRecord
 from flowrep.experiment.run import RunFolder, check_origin, origin_of
 from flowrep.experiment.runner import Runner
-from flowrep.progress import StopRequest
 from flowrep.scenes import Scene, load_scene
+from flowrep.stop import StopRequest
 from flowrep.transforms.stack import REPRESENTATIONS, representation_options
+from flowrep.usage import UsageError, closest_first
 
 PRETRAINED = Path(__file__).parents[1] / "pretrained"
 """Agents that come with flowrep, one for each scene; README.md there is their card."""

@@ -13,12 +13,12 @@ from torchrl.envs import EnvBase, InitTracker, Transform
 
 from flowrep.agent import Algorithm
 from flowrep.agent.observation import resolved_precision
-from flowrep.config import UsageError
 from flowrep.config.schema import EnvConfig, TrainConfig, validated
 from flowrep.envs import make_env, make_mirror
 from flowrep.envs.torchrl_env import usable_device
 from flowrep.envs.workers import available_cores
 from flowrep.options import ALGORITHMS, AlgorithmOptions
+from flowrep.usage import UsageError
 
 ENVS_PER_WORKER = 24  # in an evaluation: fewer aren't worth starting a process
 

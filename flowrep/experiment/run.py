@@ -21,7 +21,6 @@ import yaml
 from numpy.typing import NDArray
 
 from flowrep import __version__
-from flowrep.config import UsageError
 from flowrep.config.schema import TrainConfig, validated_run
 from flowrep.experiment.lock import FolderLock, RunFolderError, locked
 from flowrep.experiment.loggers import Loggers
@@ -33,6 +32,7 @@ from flowrep.experiment.outcomes import (
 )
 from flowrep.files import replace_file, replace_text, set_aside
 from flowrep.tables import TableError, append_rows, is_whole, read_rows, write_rows
+from flowrep.usage import UsageError
 from flowrep.yaml_file import read_yaml
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ def cpu_name() -> str:
     return next(iter(names), platform.processor() or platform.machine())
 
 
-class Drive(NamedTuple):
+class DriveKey(NamedTuple):
     """The columns that identify an episode of drives.npz and, with `scene`, of evaluation.csv."""
 
     scene_id: str
@@ -123,10 +123,10 @@ class Drive(NamedTuple):
     episode_seed: int
 
 
-def read_drives(path: Path) -> dict[Drive, tuple[str, NDArray[np.float32]]]:
+def read_drives(path: Path) -> dict[DriveKey, tuple[str, NDArray[np.float32]]]:
     """Returns each drive's outcome and positions `[T + 1, 2]`, x and y in metres.
 
-    Without a file there are none. It holds the columns of `Drive`; `outcome`; `positions`
+    Without a file there are none. It holds the columns of `DriveKey`; `outcome`; `positions`
     `[sum of T + 1, 2]`; and `starts` `[N + 1]`, so that drive n is
     `positions[starts[n]:starts[n + 1]]`.
 
@@ -137,10 +137,10 @@ def read_drives(path: Path) -> dict[Drive, tuple[str, NDArray[np.float32]]]:
         return {}
     try:
         with np.load(path, allow_pickle=False) as saved:
-            names = zip(*(saved[column].tolist() for column in Drive._fields), strict=True)
+            names = zip(*(saved[column].tolist() for column in DriveKey._fields), strict=True)
             positions = np.split(saved["positions"].reshape(-1, 2), saved["starts"][1:-1])
             driven = zip(saved["outcome"].tolist(), positions, strict=True)
-            return dict(zip(map(Drive._make, names), driven, strict=True))
+            return dict(zip(map(DriveKey._make, names), driven, strict=True))
     except Exception as error:  # zip, zlib and numpy fail on garbage in a dozen ways
         raise TableError(f"{path}: {error}") from error
 
@@ -331,10 +331,10 @@ class RunFolder:
             set_aside(self.drives_path, error.__cause__)
             drives = {}
         for each in records:
-            drive = Drive(*(getattr(each, name) for name in Drive._fields))
+            drive = DriveKey(*(getattr(each, name) for name in DriveKey._fields))
             drives[drive] = each.outcome, each.positions
         outcomes, positions = zip(*drives.values())
-        arrays: dict[str, Any] = dict(zip(Drive._fields, map(np.array, zip(*drives))))
+        arrays: dict[str, Any] = dict(zip(DriveKey._fields, map(np.array, zip(*drives))))
         arrays["outcome"], arrays["positions"] = np.array(outcomes), np.concatenate(positions)
         arrays["starts"] = np.cumsum([0, *map(len, positions)])
         replace_file(self.drives_path, lambda path: np.savez_compressed(path, **arrays))
@@ -345,4 +345,4 @@ class RunFolder:
 
 
 def _identity(row: Mapping[str, str]) -> tuple[str, ...]:
-    return tuple(row[name] for name in ("scene", *Drive._fields))
+    return tuple(row[name] for name in ("scene", *DriveKey._fields))

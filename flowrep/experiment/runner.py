@@ -7,6 +7,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
 
@@ -34,7 +35,23 @@ from flowrep.experiment.evaluation import (
 )
 from flowrep.experiment.outcomes import OUTCOMES, print_results
 from flowrep.experiment.run import RunFolder, check_origin, machine_of, origin_of
-from flowrep.progress import Every, StopRequest, Stopwatch, progress_bar
+from flowrep.progress import Stopwatch, progress_bar
+from flowrep.stop import StopRequest
+
+
+@dataclass
+class Every:
+    """True once each time a step counter passes a multiple of `interval`; never if that is 0."""
+
+    interval: int
+    last: int = 0
+
+    def __call__(self, step: int) -> bool:
+        """Returns whether `step` reached or jumped over a multiple since the last call."""
+        if not self.interval or step // self.interval <= self.last // self.interval:
+            return False
+        self.last = step
+        return True
 
 
 class Runner:

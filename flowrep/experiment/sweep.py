@@ -26,12 +26,13 @@ from typing import NoReturn
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from flowrep.config import UsageError, cli
+from flowrep.config import cli
 from flowrep.config.schema import TrainConfig, validated, validated_run
 from flowrep.experiment.outcomes import is_finished, success_of
 from flowrep.files import open_to_append
 from flowrep.options import ALGORITHMS
-from flowrep.progress import STOP_SIGNALS, StopRequest
+from flowrep.stop import STOP_SIGNALS, StopRequest
+from flowrep.usage import UsageError
 from flowrep.yaml_file import read_yaml
 
 cli.register_resolvers()  # for the paths in conf/run_folder.yaml, which a worker resolves too

@@ -9,10 +9,10 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from flowrep.config import UsageError
 from flowrep.experiment.evaluation import Policy, evaluate
 from flowrep.experiment.film import Film, how_it_ended
 from flowrep.scenes.vehicle import NO_OP, TURN_LEFT, TURN_RIGHT
+from flowrep.usage import UsageError
 
 
 class NewEpisode(Exception):

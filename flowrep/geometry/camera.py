@@ -19,9 +19,9 @@ from flowrep.geometry.checks import (
 
 FovAxis: TypeAlias = Literal["horizontal", "vertical"]
 
-# Bounds of `check_intrinsics`: on the focal length, as a multiple of the picture's longer side, and
-# on the principal point's distance from the border, as a share of the width or the height.
-SHORTEST, LONGEST, BORDER = 0.2, 20.0, 0.1
+# What `check_intrinsics` takes for possible.
+MIN_FOCAL, MAX_FOCAL = 0.2, 20.0  # focal lengths, in lengths of the picture's longer side
+MIN_BORDER = 0.1  # of the principal point to the border, as a share of the width or the height
 
 
 def project(points_cam: Tensor, K: Tensor) -> Tensor:
@@ -202,14 +202,15 @@ def check_intrinsics(
     height, width = size
     side = max(size)
     shares = K[..., :2, 2] / K.new_tensor([width, height])
-    wrong = ((focal < SHORTEST * side) | (focal > LONGEST * side)).any(-1)
-    wrong = (wrong | ((shares - 0.5).abs() > 0.5 - BORDER).any(-1)) & ~unknown
+    wrong = ((focal < MIN_FOCAL * side) | (focal > MAX_FOCAL * side)).any(-1)
+    wrong = (wrong | ((shares - 0.5).abs() > 0.5 - MIN_BORDER).any(-1)) & ~unknown
     if bool(wrong.any()):
         where, index = first_wrong(name, wrong)
         raise ValueError(
             f"{where} can't belong to a picture {width} px wide and {height} px high: fx and fy "
-            f"should be {SHORTEST * side:g} to {LONGEST * side:g} px, cx "
-            f"{BORDER * width:g} to {(1 - BORDER) * width:g}, cy {BORDER * height:g} to "
-            f"{(1 - BORDER) * height:g}; got {K[index].tolist()}. If it is for another picture "
-            "size, or was divided by the size, scale its first two rows"
+            f"should be {MIN_FOCAL * side:g} to {MAX_FOCAL * side:g} px, "
+            f"cx {MIN_BORDER * width:g} to {(1 - MIN_BORDER) * width:g}, "
+            f"cy {MIN_BORDER * height:g} to {(1 - MIN_BORDER) * height:g}; "
+            f"got {K[index].tolist()}. If it is for another picture size, or was divided by the "
+            "size, scale its first two rows"
         )

@@ -33,7 +33,7 @@ MIN_DEPTH_RATIO = 0.01
 
 # Bounds on valid input, far beyond any camera's values. Within them nothing overflows in float32.
 LARGEST = 1e8  # of the entries of K, A and e: pixels, metres and their products
-SMALLEST = 1e-8  # of depth in metres, and of dt
+LEAST_POSITIVE = 1e-8  # of depth in metres, and of dt
 
 Planes = tuple[Tensor, Tensor, Tensor]  # u, v, valid: [*B, H, W] each
 
@@ -47,7 +47,7 @@ def known_camera(K: Tensor, dt: float | Tensor) -> tuple[Tensor, float | Tensor,
     K = torch.where(known[..., None, None], K, torch.eye(3, dtype=K.dtype, device=K.device))
     if isinstance(dt, Tensor):
         dt = dt.to(K.dtype)
-        runs = dt.isfinite() & (dt >= SMALLEST)
+        runs = dt.isfinite() & (dt >= LEAST_POSITIVE)
         dt, known = torch.where(runs, dt, 1.0), known & runs
     return K, dt, known
 
@@ -115,7 +115,7 @@ def flow_planes(
     Depth is `[*B, H, W]`; all other arguments broadcast with it.
     """
     depth = depth.to(x.dtype)
-    has_depth = depth >= SMALLEST  # nan compares False
+    has_depth = depth >= LEAST_POSITIVE  # nan compares False
     # The result is masked in any case. For gradients, the inputs of both divisions must be masked
     # as well, because the derivative of an unused branch is 0 · inf = nan. Eager code without
     # gradients skips these two passes. Compiled code must accept any input, and fuses them.

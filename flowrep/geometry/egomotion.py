@@ -33,7 +33,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from flowrep.geometry.checks import check_shape, common_batch
-from flowrep.geometry.closed_form import LARGEST, MIN_DEPTH_RATIO, SMALLEST, known_camera
+from flowrep.geometry.closed_form import LARGEST, LEAST_POSITIVE, MIN_DEPTH_RATIO, known_camera
 from flowrep.geometry.pose import without_autocast
 
 VOTERS = 1 << 15  # pixels in the final choice; a share of so many is accurate to 1 %
@@ -61,7 +61,7 @@ _RIVAL_STEPS = 3  # Gauss-Newton steps of the second candidate
 _INLIER_SCALES = 2.5  # in standard deviations; 96 % of normal errors in two channels are within
 _STILL_PX = 0.2  # flow with residuals up to this standard deviation may be that of a still camera
 _LEAST_STRENGTH = 0.1  # least mean square of a motion's flow, relative to that of the residuals
-_CHANCES = 16  # least strength of a motion, relative to that of one fitted to noise, 3 / N
+_LEAST_OVER_CHANCE = 16  # least strength, relative to that of a motion fitted to noise, 3 / N
 _LEAST_SCALE_PX = 2e-3  # far above the rounding of exact float32 flow, far below any measured flow
 _SCALES = 1.5  # standard deviations at which the weight of a pixel is a quarter
 _QUANTILE = 1 / 3  # of residuals, which gives their scale; half of the pixels may be outliers
@@ -275,7 +275,7 @@ def _voters(
     each = (m.flatten(-2).gather(-1, pixel.expand(*m.shape[:2], -1)) for m in maps)
     values = torch.cat([*each], 1)  # [B, 3 or 6, N]
     u, v, z = values[:, :3].unbind(1)
-    known = u.isfinite() & v.isfinite() & (z >= SMALLEST)  # nan compares False
+    known = u.isfinite() & v.isfinite() & (z >= LEAST_POSITIVE)  # nan compares False
     known &= known_frame.unsqueeze(-1)
     if structure is not None:
         known &= values[:, 3] + values[:, 5] > _LEAST_TEXTURE
@@ -562,5 +562,5 @@ def _is_motion(samples: _Samples, now: _Weighted) -> Tensor:
     deviation = now.scale / _SCALES
     strength = ego / (2 * deviation.square())
     by_chance = 3 / (samples.number - MIN_PIXELS).clamp(min=1)
-    is_shown = (strength > _LEAST_STRENGTH) & (strength > _CHANCES * by_chance)
+    is_shown = (strength > _LEAST_STRENGTH) & (strength > _LEAST_OVER_CHANCE * by_chance)
     return (deviation <= _STILL_PX) | is_shown

@@ -19,7 +19,7 @@ Direction: TypeAlias = Literal["forward", "backward"]
 Grid: TypeAlias = Literal["current", "previous"]
 Channels: TypeAlias = Literal["uv", "row_column"]
 
-SMALL = 1 << 14  # pixels up to which PyTorch is as fast as numba, which then isn't loaded
+MAX_PIXELS_WITHOUT_NUMBA = 1 << 14  # PyTorch is as fast up to here; numba isn't loaded
 
 
 class Flow(NamedTuple):
@@ -268,10 +268,10 @@ def _check(
             )
     if isinstance(dt, Tensor):
         batches["dt"] = dt.shape
-    elif not closed_form.SMALLEST <= dt < math.inf:
+    elif not closed_form.LEAST_POSITIVE <= dt < math.inf:
         raise ValueError(
             "dt must be positive (current time minus previous time), at least "
-            f"{closed_form.SMALLEST:g} and finite; got {dt}"
+            f"{closed_form.LEAST_POSITIVE:g} and finite; got {dt}"
         )
     return common_batch(**batches)
 
@@ -356,7 +356,7 @@ def _suits_numba(depth: Tensor, *others: float | Tensor) -> bool:
     tensors = [depth, *(other for other in others if isinstance(other, Tensor))]
     return (
         depth.is_cpu
-        and depth.numel() > SMALL
+        and depth.numel() > MAX_PIXELS_WITHOUT_NUMBA
         and all(tensor.dtype is torch.float32 and _is_plain(tensor) for tensor in tensors)
         and numba_is_installed()
     )

@@ -17,10 +17,10 @@ from torch import Tensor
 
 from flowrep.extras import compiled
 from flowrep.geometry.checks import check_rows
-from flowrep.geometry.closed_form import MIN_DEPTH_RATIO, SMALLEST, Planes, largest_raw
+from flowrep.geometry.closed_form import LEAST_POSITIVE, MIN_DEPTH_RATIO, Planes, largest_raw
 
 # numpy's float32 scalars: a Python float would make numba compute in float64.
-_LEAST_DEPTH, _LEAST_RATIO = np.float32(SMALLEST), np.float32(MIN_DEPTH_RATIO)
+_LEAST_DEPTH, _LEAST_RATIO = np.float32(LEAST_POSITIVE), np.float32(MIN_DEPTH_RATIO)
 _LARGEST_RAW = np.float32(largest_raw(torch.float32))
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 

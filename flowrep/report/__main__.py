@@ -11,9 +11,9 @@ from flowrep.extras import require
 
 require("a report", "report", "hydra", "pydantic", "matplotlib", "scipy", "jinja2", module=__name__)
 
-from flowrep.config import UsageError
 from flowrep.config.cli import run_command
 from flowrep.config.schema import ReportConfig
+from flowrep.usage import UsageError
 
 
 def report(config: ReportConfig) -> Path:
@@ -32,7 +32,7 @@ def report(config: ReportConfig) -> Path:
     if not runs:
         raise UsageError("none of the runs can be read, see above")
 
-    from flowrep.report.page import drives_of, render_page, summary
+    from flowrep.report.page import plans_and_films_of, render_page, summary
     from flowrep.report.sections import assemble, write_files
 
     print(summary(runs))
@@ -48,7 +48,7 @@ def report(config: ReportConfig) -> Path:
     output.mkdir(parents=True, exist_ok=True)
     for folder in write_files(assembled, output):
         print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
-    drives = drives_of(runs, trajectories=config.trajectories, videos=config.videos)
+    drives = plans_and_films_of(runs, trajectories=config.trajectories, videos=config.videos)
     for warning in drives.warnings:
         print(f"drives: {warning}")
     page = output / "index.html"

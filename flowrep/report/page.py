@@ -38,7 +38,7 @@ class EmbeddedPicture(NamedTuple):
     data: str  # a data URI
 
 
-class Drives(NamedTuple):
+class PlansAndFilms(NamedTuple):
     """Plans by scene, films by episode, and a warning for each run without them."""
 
     plans: dict[str, list[EmbeddedPicture]]
@@ -46,7 +46,7 @@ class Drives(NamedTuple):
     warnings: list[str]
 
 
-def drives_of(runs: Sequence[Run], *, trajectories: int, videos: int) -> Drives:
+def plans_and_films_of(runs: Sequence[Run], *, trajectories: int, videos: int) -> PlansAndFilms:
     """Returns a plan of drives, and films, of one agent of each group, scene and stack.
 
     Args:
@@ -54,7 +54,7 @@ def drives_of(runs: Sequence[Run], *, trajectories: int, videos: int) -> Drives:
         trajectories: the number of drives in a plan.
         videos: the number of films of an agent.
     """
-    drives = Drives({}, {}, [])
+    drives = PlansAndFilms({}, {}, [])
     shown: dict[Any, Run] = {}
     for number, group in enumerate(groups_of(runs)):
         for run in sorted(group.runs, key=lambda run: run.seed):
@@ -117,7 +117,7 @@ def data_uri(kind: str, data: bytes) -> str:
     return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"
 
 
-def render_page(report: Report, drives: Drives) -> str:
+def render_page(report: Report, drives: PlansAndFilms) -> str:
     """Returns the page of a report as HTML."""
     runs, stacks = report.runs, sorted({run.stack for run in report.runs})
     what = listed(stacks) if len(stacks) < 4 else f"{len(stacks)} stacks"

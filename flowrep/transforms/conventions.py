@@ -35,8 +35,8 @@ class Convention:
     Args:
         simulator: its name, and the version that has this convention.
         sources: documentation or code of the simulator that states the convention.
-        tried: the file that tests it on the simulator; empty if it is only tested on buffers that
-            were written as the sources say.
+        tested_in: the file that tests it on the simulator; empty if it is only tested on buffers
+            that were written as the sources say.
         layout: of maps, `"hw"` or `"hwc"`.
         ids_layout: of ids, if it differs; of several channels, the first is read.
         depth: options of `AdaptDepth` for each depth buffer, the usual buffer first.
@@ -54,7 +54,7 @@ class Convention:
 
     simulator: str
     sources: tuple[str, ...]
-    tried: str = ""
+    tested_in: str = ""
     layout: MapLayout = "hw"
     ids_layout: MapLayout | None = None
     depth: Mapping[str, Mapping[str, Any]]
@@ -117,7 +117,7 @@ CONVENTIONS: dict[str, Convention] = {
     "maniskill": Convention(
         simulator="ManiSkill 3.0.1",
         sources=("mani_skill.render.shaders; mani_skill.sensors.camera",),
-        tried="examples/maniskill_flow.py",
+        tested_in="examples/maniskill_flow.py",
         layout="hwc",
         depth={"depth": {"kind": "z", "scale_m": 1e-3, "sky": 0.0}},
         pose=("cam2world_gl",),
@@ -132,7 +132,7 @@ CONVENTIONS: dict[str, Convention] = {
     "mujoco": Convention(
         simulator="MuJoCo 3.17",
         sources=("mujoco.readthedocs.io: Python, Renderer; XML reference, body/camera",),
-        tried="examples/mujoco_flow.py",
+        tested_in="examples/mujoco_flow.py",
         ids_layout="hwc",
         depth={"depth": {"kind": "z", "sky": "far_m"}},
         pose=("camera_pose",),
@@ -150,7 +150,7 @@ CONVENTIONS: dict[str, Convention] = {
     "mjlab": Convention(
         simulator="mjlab 1.6 (MuJoCo Warp 4.0)",
         sources=("mjlab.sensor.camera_sensor; mujoco_warp._src.render",),
-        tried="examples/mjlab_flow.py, on a CPU",
+        tested_in="examples/mjlab_flow.py, on a CPU",
         layout="hwc",
         depth={"depth": {"kind": "z", "sky": 0.0}},
         pose=("camera_pose",),
@@ -167,7 +167,7 @@ CONVENTIONS: dict[str, Convention] = {
     "newton": Convention(
         simulator="Newton 1.8",
         sources=("newton.sensors.SensorCamera; newton.State.body_q",),
-        tried="examples/newton_flow.py, on a CPU",
+        tested_in="examples/newton_flow.py, on a CPU",
         depth={
             "forward_depth": {"kind": "z", "sky": 0.0},
             "depth": {"kind": "ray_length", "sky": 0.0, "intrinsics": "intrinsics"},
@@ -187,7 +187,7 @@ CONVENTIONS: dict[str, Convention] = {
     "genesis": Convention(
         simulator="Genesis 1.4.5",
         sources=("genesis.vis.camera.Camera: render, transform, intrinsics",),
-        tried="tests/transforms/test_conventions.py, on a CPU",
+        tested_in="tests/transforms/test_conventions.py, on a CPU",
         depth={"depth": {"kind": "z", "sky": "far_m"}},
         pose=("transform",),
         pose_options={"axes": "opengl"},
@@ -282,7 +282,7 @@ CONVENTIONS: dict[str, Convention] = {
     "pybullet": Convention(
         simulator="PyBullet 3.2.7",
         sources=("PyBullet Quickstart Guide: getCameraImage, computeViewMatrix",),
-        tried="tests/transforms/test_conventions.py",
+        tested_in="tests/transforms/test_conventions.py",
         depth={"depth": {"kind": "z_buffer", "near_m": "near_m", "far_m": "far_m"}},
         pose=("view",),
         pose_options={"direction": "world_to_camera", "axes": "opengl"},

@@ -129,7 +129,7 @@ def representation_stack(
     keys = {name: NOISY_SENSORS[name].key for name in _NOISY_KEYS}
     keys |= {name: key for name, key in _NOISY_KEYS.items() if noisy and key in noisy[0].out_keys}
     camera = _Camera(
-        k={"intrinsics": intrinsics, "prev_intrinsics": prev_intrinsics},
+        intrinsics={"intrinsics": intrinsics, "prev_intrinsics": prev_intrinsics},
         depth=keys["depth"],
         motion=_ESTIMATED_MOTION_KEY if estimates_motion else keys["motion"],
         compiled=compiled,
@@ -286,14 +286,14 @@ def _maps(
 class _Camera:
     """What the flow transforms have in common: K, and the keys of depth and motion."""
 
-    k: Arguments
+    intrinsics: Arguments
     depth: NestedKey
     motion: NestedKey
     compiled: bool
 
     @property
     def options(self) -> Arguments:
-        return {**self.k, "compiled": self.compiled}
+        return {**self.intrinsics, "compiled": self.compiled}
 
 
 def _exact_flow(
@@ -330,7 +330,7 @@ def _estimated_flow(
         motion = [_motion(_ESTIMATED_FLOW_KEY, camera, picture)] if estimates_motion else []
         return [pictures, plain, *motion]
     inputs = [_PICTURES_KEY, camera.depth, camera.motion]
-    compensated = EstimatedFlow(**estimator, **written, **camera.k, in_keys=inputs)
+    compensated = EstimatedFlow(**estimator, **written, **camera.intrinsics, in_keys=inputs)
     if not estimates_motion:
         return [pictures, compensated]
     # A coarser estimate is enough for the camera's motion.
@@ -347,7 +347,7 @@ def _estimated_flow(
 def _motion(flow: NestedKey, camera: _Camera, picture: NestedKey | None = None) -> Transform:
     """Returns the transform that estimates the camera's motion from flow and depth."""
     return EstimateCameraMotion(
-        **camera.k,
+        **camera.intrinsics,
         picture=picture,
         outputs=["motion"],
         in_keys=[flow, camera.depth],

@@ -14,7 +14,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 import flowrep
-from flowrep.config import CONF_DIR, UsageError, cli, schema
+from flowrep.config import CONF_DIR, cli, schema
+from flowrep.usage import UsageError
 from tests.running import run_python
 
 SCHEMAS = {

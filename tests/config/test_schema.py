@@ -2,7 +2,6 @@
 
 import pytest
 
-from flowrep.config import UsageError
 from flowrep.config.schema import (
     EvaluateConfig,
     ExportConfig,
@@ -14,6 +13,7 @@ from flowrep.config.schema import (
     validated_run,
 )
 from flowrep.scenes import Scene
+from flowrep.usage import UsageError
 from tests.config.composing import composed, plain
 
 

@@ -7,11 +7,11 @@ import pytest
 pytest.importorskip("pybullet", reason="a run is built with the simulator")
 
 from flowrep.agent import DoubleDQN, observation
-from flowrep.config import UsageError
 from flowrep.config.schema import ForeignAlgorithm
 from flowrep.experiment import build
 from flowrep.experiment.build import algorithm, evaluation_workers, with_precision
 from flowrep.options import ALGORITHMS
+from flowrep.usage import UsageError
 from tests.config.composing import composed
 
 

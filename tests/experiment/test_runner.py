@@ -10,14 +10,15 @@ from tensordict import TensorDict
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from flowrep.agent import CheckpointError, DivergenceError
-from flowrep.config import UsageError, group_choices
+from flowrep.config import group_choices
 from flowrep.experiment import build
 from flowrep.experiment.lock import RunFolderError
 from flowrep.experiment.run import RunFolder
-from flowrep.experiment.runner import Means, RecentEpisodes, Runner, progress_text
-from flowrep.progress import StopRequest
+from flowrep.experiment.runner import Every, Means, RecentEpisodes, Runner, progress_text
+from flowrep.stop import StopRequest
 from flowrep.train import finish as finish_run
 from flowrep.train import resumed
+from flowrep.usage import UsageError
 from tests.comparing import differing
 from tests.config.composing import composed, plain
 
@@ -40,6 +41,17 @@ STEPS = [
     step([4.0, 40.0], [SUCCESS, RUNNING]),  # the first: return 7 in 3
     step([8.0, 80.0], [RUNNING, SUCCESS]),  # the second's next one: return 120 in 2
 ]
+
+
+def test_every_fires_once_for_each_multiple_that_a_jump_passes():
+    every = Every(100)
+    assert [step for step in range(0, 257, 32) if every(step)] == [128, 224]
+    assert not any(map(Every(0), range(5)))
+
+
+def test_every_continues_after_a_resume_without_firing_again():
+    assert not Every(100, last=130)(150)
+    assert Every(100, last=130)(201)
 
 
 def test_episodes_of_each_street_are_summed_up_apart():

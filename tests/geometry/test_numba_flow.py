@@ -16,12 +16,12 @@ pytest.importorskip("numba")
 
 UNKNOWN = torch.full((4, 4), math.nan, dtype=torch.float64)
 FROM_BEHIND = rigid((0.0, 0.0, 0.0), (0.0, 0.0, -9.0))
-LEAST = float(np.float32(closed_form.SMALLEST))
+LEAST = float(np.float32(closed_form.LEAST_POSITIVE))
 
 
 @pytest.fixture(autouse=True)
 def _no_map_is_small(monkeypatch):
-    monkeypatch.setattr(flow_module, "SMALL", 0)
+    monkeypatch.setattr(flow_module, "MAX_PIXELS_WITHOUT_NUMBA", 0)
 
 
 @pytest.fixture
@@ -54,7 +54,7 @@ def scene(dtype=torch.float32):
 def by_torch(compute, *args, **options):
     """Returns what PyTorch computes without the kernel."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(flow_module, "SMALL", 1 << 30)
+        patch.setattr(flow_module, "MAX_PIXELS_WITHOUT_NUMBA", 1 << 30)
         return compute(*args, **options)
 
 
@@ -135,9 +135,9 @@ def test_other_floats_are_left_to_pytorch(calls, dtype):
 
 def test_small_maps_and_those_without_numba_are_left_to_pytorch(calls, monkeypatch):
     depth, _, Ks, motions = scene()
-    monkeypatch.setattr(flow_module, "SMALL", depth.numel())
+    monkeypatch.setattr(flow_module, "MAX_PIXELS_WITHOUT_NUMBA", depth.numel())
     ego_flow(depth, Ks, motions[:, 0])
-    monkeypatch.setattr(flow_module, "SMALL", 0)
+    monkeypatch.setattr(flow_module, "MAX_PIXELS_WITHOUT_NUMBA", 0)
     monkeypatch.setattr(flow_module, "numba_is_installed", lambda: False)
     ego_flow(depth, Ks, motions[:, 0])
     assert not calls

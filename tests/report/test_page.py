@@ -18,7 +18,7 @@ from flowrep.config.schema import ReportConfig
 from flowrep.experiment.run import DRIVES
 from flowrep.report.__main__ import main, report
 from flowrep.report.figures import draw_bars, encoded
-from flowrep.report.page import drives_of, tracks_of
+from flowrep.report.page import plans_and_films_of, tracks_of
 from flowrep.report.runs import Condition, grid_of
 from flowrep.report.storage import read_run, read_runs
 from tests.report.folders import config_of, letters, rows_of, run_in, write_run
@@ -158,7 +158,7 @@ def test_a_run_without_drives_or_films_is_a_line(tmp_path, content):
     run = run_in(tmp_path, "a run, mine", "sco")
     if content is not None:
         (run / DRIVES).write_bytes(content)
-    drives = drives_of([read_run(run)], trajectories=2, videos=1)
+    drives = plans_and_films_of([read_run(run)], trajectories=2, videos=1)
     assert (drives.plans, drives.films) == ({}, {})
     assert ["plan" in line for line in drives.warnings] == [True, False]
     *_, where, what = shlex.split(drives.warnings[1])  # as a shell reads the remedy
@@ -175,7 +175,7 @@ def test_a_plan_and_films_of_one_agent_of_each_stack(tmp_path):
         for name in ("a", "b"):
             (folder / "videos" / f"{name}.mp4").write_bytes(b"film")
     runs, _ = read_runs([tmp_path])
-    drives = drives_of(runs, trajectories=3, videos=1)
+    drives = plans_and_films_of(runs, trajectories=3, videos=1)
     ((place, (plan,)),) = drives.plans.items()
     assert (place, plan.title) == ("Straight Road", "ego+obj, seed 0 (run0)")
     assert plan.caption == "drives: 1 out of bounds, 1 success, 1 collision"
@@ -191,7 +191,7 @@ def test_a_run_whose_scene_is_unknown_is_a_line_and_the_others_have_their_plan(t
         config = config_of(stack=stack) | {"scene": scene | changes}
         write_drives(write_run(tmp_path / stack, config, rows_of(config, "sco")))
     runs, _ = read_runs([tmp_path])
-    drives = drives_of(runs, trajectories=1, videos=0)
+    drives = plans_and_films_of(runs, trajectories=1, videos=0)
     assert [plan.title.split(",")[0] for plan in drives.plans["Straight Road"]] == ["raw"]
     (warning,) = drives.warnings
     assert str(tmp_path / "ego") in warning
@@ -218,7 +218,7 @@ def test_a_film_that_lies_outside_of_the_run_is_not_embedded(tmp_path, linked):
     else:
         (run / "videos").mkdir()
         (run / "videos" / "a.mp4").symlink_to(tmp_path / "elsewhere" / "a.mp4")
-    drives = drives_of([read_run(run)], trajectories=0, videos=1)
+    drives = plans_and_films_of([read_run(run)], trajectories=0, videos=1)
     assert drives.films == {}
     (warning,) = drives.warnings
     # the remedy is one that the command takes

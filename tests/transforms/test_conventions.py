@@ -435,7 +435,7 @@ def test_the_page_has_every_row_and_its_python_runs():
     table = page.split("## By name")[0]
     for name, row in CONVENTIONS.items():
         (line,) = [line for line in table.splitlines() if f'`"{name}"`' in line]
-        assert (line.rstrip(" |").rsplit("| ", 1)[1] == "no") == (not row.tried)
+        assert (line.rstrip(" |").rsplit("| ", 1)[1] == "no") == (not row.tested_in)
         assert ("not documented" in line) <= (not row.flow)
     pytest.importorskip("pybullet")
     scope: dict = {}
@@ -446,7 +446,7 @@ def test_the_page_has_every_row_and_its_python_runs():
     scope["pybullet"].disconnect(scope["client"])
 
 
-# On the simulator itself; MuJoCo's, mjlab's and ManiSkill's rows are tried by tests/examples
+# On the simulator itself; MuJoCo's, mjlab's and ManiSkill's rows are tested by tests/examples
 
 
 @pytest.mark.slow
