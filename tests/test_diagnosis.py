@@ -438,7 +438,7 @@ def test_every_adapter_that_is_printed_for_an_env_can_be_made():
     assert calls["pose_lag_frames=1"] == "pose_lag_frames=1"
 
 
-def test_flow_that_was_measured_is_a_witness_of_its_own(frames):
+def test_flow_that_was_measured_is_a_reference_of_its_own(frames):
     found = spoilt(frames, raw=lambda flow: -flow)
     assert "flow_direction=backward" in found.suspects
     assert "AdaptFlow" in found.words

@@ -18,8 +18,8 @@ from flowrep.diagnosis.fit import (
     Pairs,
     best_motion,
     median,
-    px_of,
-    residual,
+    quantile_px,
+    residuals,
     sampled,
     seen_before,
 )
@@ -100,7 +100,7 @@ def diagnose(
     rivals = rivals_of({}, by_flow=is_measured, of_flow=is_measured, absolute=is_absolute)
     stand = [name for name, why in zip(names, reasons) if why == STANDS]
     named = [names[i] for i in able.tolist()]
-    result = diagnosed(pairs.of(able), [], rivals, named, _call, stand)
+    result = diagnosed(pairs.select(able), [], rivals, named, _call, stand)
     faults, odd = _recomputed(seen, ego_key, obj_key)
     kind, of_bodies = ("", "") if result.is_wrong else _bodies(seen, pairs.depth_step)
     odd += left_out(reasons, sum(not why for why in reasons))
@@ -178,7 +178,7 @@ class _Seen:
             valid = now.get(f"{raw_key}_valid", torch.ones_like(self.flow.valid))
             self.raw = torch.where(valid, self.raw.double(), math.nan)
             expected = torch.where(self.flow.valid, self.flow.flow, math.nan)
-            self.is_derived = not median(px_of((self.raw - expected).flatten(2))) > 0.01
+            self.is_derived = not median(quantile_px((self.raw - expected).flatten(2))) > 0.01
 
     def flow_of(self, motion: Tensor) -> geometry.Flow:
         """Returns the flow of a static world."""
@@ -256,23 +256,25 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[str, str]:
     pairs = pairs._replace(depth_step=depth_step, coarseness=depth_step / pairs.depth)
     still = seen.motion[frame]
     at, at_rest = (seen_before(pairs, motion)[0] for motion in (pairs.motion, still))
-    moved_px, left = px_of(at - at_rest), px_of(residual(pairs, pairs.motion), 0.5)
-    number = residual(pairs, pairs.motion).isfinite().sum((1, 2))
-    tells = (torch.maximum(moved_px, left) >= _MOVED_PX) & (number >= _FEW_PIXELS)
+    residuals_px = residuals(pairs, pairs.motion)
+    moved_px, residual_px = quantile_px(at - at_rest), quantile_px(residuals_px, 0.5)
+    number = residuals_px.isfinite().sum((1, 2))
+    tells = (torch.maximum(moved_px, residual_px) >= _MOVED_PX) & (number >= _FEW_PIXELS)
     if int(tells.sum()) < _FEW_FRAMES:
         return "untested", unseen
-    pairs, left, moved_px, body = pairs.of(tells), left[tells], moved_px[tells], body[tells]
-    best = px_of(residual(pairs, best_motion(pairs, pairs.motion, still[tells])), 0.5)
-    at_rest_px = px_of(residual(pairs, still[tells]), 0.5)
+    pairs, body, still = pairs.select(tells), body[tells], still[tells]
+    residual_px, moved_px = residual_px[tells], moved_px[tells]
+    best_px = quantile_px(residuals(pairs, best_motion(pairs, pairs.motion, still)), 0.5)
+    at_rest_px = quantile_px(residuals(pairs, still), 0.5)
     least = INTERPOLATED_PX + _ROUND * moved_px
-    for says, of in (
+    for name, rows in (
         ("the bodies", body > 0), *((f"body {i}", body == i) for i in body.unique().tolist())
     ):  # fmt: skip
-        is_off = int(of.sum()) >= _FEW_FRAMES and median(left[of] - least[of]) > 0
-        if is_off and is_better(best[of], left[of]):
-            size = f"{median(left[of]):.2g} px are left (flow: {median(moved_px[of]):.2g} px)"
-            why = f"instance_motion or ids don't fit {says}: {size}"
-            why += f", and a motion exists that would leave {median(best[of]):.2g} px"
+        is_off = int(rows.sum()) >= _FEW_FRAMES and median((residual_px - least)[rows]) > 0
+        if is_off and is_better(best_px[rows], residual_px[rows]):
+            px, flow, best = (median(each[rows]) for each in (residual_px, moved_px, best_px))
+            why = f"instance_motion or ids don't fit {name}: {px:.2g} px are left"
+            why += f" (flow: {flow:.2g} px), and a motion exists that would leave {best:.2g} px"
             return "fault", why
     # A flat body that moves aside changes no depth: it might as well be at rest.
     if int((at_rest_px > least).sum()) < _FEW_FRAMES:

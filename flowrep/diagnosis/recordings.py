@@ -16,7 +16,7 @@ from flowrep.diagnosis.fit import (
     FITTED,
     Pairs,
     best_motion,
-    px_of,
+    quantile_px,
     sampled,
     seen_before,
 )
@@ -110,14 +110,14 @@ class Examination:
 
 def why_not(pairs: Pairs) -> list[str]:
     """Returns why a pair can't be tested, "" if it can, `STANDS` if depth denies a standstill."""
-    ego = px_of(pairs.pixel - seen_before(pairs, pairs.motion)[0]).nan_to_num(0.0)
-    moves = torch.maximum(px_of(pairs.raw).nan_to_num(0.0), ego) >= _LEAST_MOVEMENT_PX
+    ego = quantile_px(pairs.pixel - seen_before(pairs, pairs.motion)[0]).nan_to_num(0.0)
+    moves = torch.maximum(quantile_px(pairs.raw).nan_to_num(0.0), ego) >= _LEAST_MOVEMENT_PX
     number, has_depth = (~pairs.depth.isnan()).sum(-1), pairs.now.isfinite().flatten(1).any(1)
     tells = has_depth & (number >= _LEAST_PIXELS)
     # A camera that stands still leaves depth as it is.
     still, stands = (tells & ~moves).nonzero()[:, 0], torch.zeros_like(moves)
     if len(still) and pairs.has_poses:
-        few = pairs.of(still, slice(FITTED))._replace(by_flow=False, scale_px=0.5)
+        few = pairs.select(still, slice(FITTED))._replace(by_flow=False, scale_px=0.5)
         rest = fitted(few, best_motion(few, few.motion), few.has_poses)
         stands[still] = rest.shown > max(rest.least, _LEAST_MOVEMENT_PX)
     return [_reason(*each) for each in zip(*map(Tensor.tolist, (has_depth, number, moves, stands)))]

@@ -16,11 +16,11 @@ from flowrep.diagnosis.fit import (
     EYE,
     INTERPOLATED_PX,
     Pairs,
-    apart,
     best_motion,
+    difference_px,
     median,
-    px_of,
-    residual,
+    quantile_px,
+    residuals,
     spread_of,
 )
 from flowrep.diagnosis.rivals import Rival
@@ -120,17 +120,18 @@ def diagnosed(
     recorded, others = _explanations(pairs, starts, rivals)
     width, motion = pairs.now.shape[-1], pairs.motion if pairs.has_poses else recorded.motion
     ego = pairs.pixel - fit.seen_before(pairs, motion)[0]
-    flow_px = px_of(pairs.raw if pairs.by_flow else ego)
+    flow_px = quantile_px(pairs.raw if pairs.by_flow else ego)
     raw_px = median(flow_px)
     noise = torch.stack([e.spread for e in (recorded, *others)]).nan_to_num(math.inf).amin(0)
     errors, least = recorded.beyond(noise, recorded.shown), recorded.least
-    error, best_px = median(errors), median(px_of(residual(pairs, recorded.motion, plain=True)))
+    error = median(errors)
+    best_px = median(quantile_px(residuals(pairs, recorded.motion, plain=True)))
     able = _able(others, errors, noise, raw_px) if error > least else []
     texts = [each.rival.texts(each.n, width) for each in able]
     numbers: dict[str, Any] = {
         "pairs": len(errors), "raw_px": raw_px, "best_px": best_px, "error_px": error,
-        "left_px": median(px_of(residual(pairs, motion, plain=True))),
-        "rivals_px": {each.rival.texts(each.n, width)[0]: each.left for each in others},
+        "left_px": median(quantile_px(residuals(pairs, motion, plain=True))),
+        "rivals_px": {each.rival.texts(each.n, width)[0]: each.residual_px for each in others},
         "suspects": tuple(typed for typed, _ in texts),
     }  # fmt: skip
     ways = " or ".join(
@@ -138,7 +139,7 @@ def diagnosed(
         f"{median(each.beyond(noise)):.2g} px)"
         for each, (typed, says) in zip(able, texts)
     )
-    size = f"{error:.2g} px (flow: {max(raw_px, median(px_of(ego))):.2g} px)"
+    size = f"{error:.2g} px (flow: {max(raw_px, median(quantile_px(ego))):.2g} px)"
     is_doubtful = pairs.is_estimated and best_px > _DOUBTFUL * raw_px + _DOUBTFUL_PX
     if is_doubtful and (not able or len(able[0].n)):  # to learn from such flow is no explanation
         why = f"flow estimated from the pictures fits no motion: {best_px:.2g} px are left"
@@ -162,7 +163,7 @@ def diagnosed(
         why = f"poses of {len(stray)} in {count} pairs don't fit: {', '.join(stray)}"
         return Diagnosis("something is wrong", why, **numbers)
     if not pairs.by_flow:
-        hidden = median(pairs.K[:, 0, 0] * px_of(pairs.coarseness.unsqueeze(1), 0.5))
+        hidden = median(pairs.K[:, 0, 0] * quantile_px(pairs.coarseness.unsqueeze(1), 0.5))
         error = numbers["error_px"] = max(error, hidden)
         size = f"{error:.2g} px (flow: {raw_px:.2g} px)"
     steps = f"depth's steps of {pairs.depth_step:.2g} m hide"
@@ -202,26 +203,26 @@ class _Fit:
     spread: Tensor
 
     def beyond(self, noise: Tensor, error: Tensor | None = None) -> Tensor:
-        """Returns what is left beyond noise."""
+        """Returns the errors beyond noise, of the motion and of what a correction doesn't reach."""
         error = self.error if error is None else error
         return (error.square() + (self.spread.square() - noise.square()).clamp(min=0)).sqrt()
 
     @property
-    def left(self) -> float:
-        """The median of all that is left."""
+    def residual_px(self) -> float:
+        """The median of errors and noise together."""
         return median(self.beyond(0 * self.spread))
 
     @property
     def least(self) -> float:
         """The error below which there is none."""
         pairs = self.pairs
-        bias = _OF_ESTIMATED * median(px_of(pairs.raw)) if pairs.is_estimated else 0.0
+        bias = _OF_ESTIMATED * median(quantile_px(pairs.raw)) if pairs.is_estimated else 0.0
         return max(self.floor, bias, 0.0 if pairs.by_flow else INTERPOLATED_PX)
 
     @cached_property
     def floor(self) -> float:
         """The error below which errors are alike, by how far two halves of the picture differ."""
-        halves_px = _SEVERAL * median(apart(self.pairs, *self.halves[1])) / 2
+        halves_px = _SEVERAL * median(difference_px(self.pairs, *self.halves[1])) / 2
         return max(_EXACT_PX, halves_px, _OF_NOISE * median(self.spread))
 
     @cached_property
@@ -245,11 +246,10 @@ class _Fit:
         """
         if not self.pairs.has_poses:
             return self.error
-        known, others = self.halves
-        agree = [
-            fit.agreement(half, residual(half, torch.stack([self.pairs.motion, motion]))).mean(-1)
-            for half, motion in zip(known, others[::-1])
-        ]
+        agree = []
+        for half, motion in zip(self.halves[0], self.halves[1][::-1]):
+            residuals_px = residuals(half, torch.stack([self.pairs.motion, motion]))
+            agree.append(fit.agreement(half, residuals_px).mean(-1))
         better = torch.stack([now < then for now, then in agree])
         count = better.numel()
         by_no_chance = 2 * int(better.sum()) - count > 2 * count**0.5
@@ -257,15 +257,15 @@ class _Fit:
 
     @property
     def is_unexplained(self) -> bool:
-        """Whether what is left can be predicted, and so is no noise."""
-        least, smooth = self.least, _smoothed(self.pairs, self.motion)
-        structure = median((self.spread.square() - smooth.square()).clamp(min=0).sqrt())
+        """Whether the residuals can be predicted, and so are no noise."""
+        least, noise = self.least, _without_trend(self.pairs, self.motion)
+        structure = median((self.spread.square() - noise.square()).clamp(min=0).sqrt())
         if structure > least:
-            is_large = structure > _STRUCTURED * median(px_of(self.pairs.raw))
-            share = median(smooth) / max(median(self.spread), 1e-12)
-            if share < 1 / _SEVERAL or (is_large and is_better(smooth, self.spread)):
+            is_large = structure > _STRUCTURED * median(quantile_px(self.pairs.raw))
+            share = median(noise) / max(median(self.spread), 1e-12)
+            if share < 1 / _SEVERAL or (is_large and is_better(noise, self.spread)):
                 return True
-        if len(smooth) < _MANY_PAIRS or not median(self.shown) > least:
+        if len(noise) < _MANY_PAIRS or not median(self.shown) > least:
             return False
         return is_better(_mapped(self.pairs, self.motion), self.shown)
 
@@ -283,7 +283,8 @@ def _explanations(
     pairs: Pairs, starts: Sequence[Tensor], rivals: Sequence[Rival]
 ) -> tuple[_Fit, list[_Fit]]:
     """Returns what the data leave, as they are and as each rival that may help corrects them."""
-    few, none, has_poses = pairs.of(pixels=slice(fit.FITTED)), pairs.depth[:, :0], pairs.has_poses
+    few, none = pairs.select(pixels=slice(fit.FITTED)), pairs.depth[:, :0]
+    has_poses = pairs.has_poses
     still = EYE.expand(len(none), 4, 4)
     starts = [*starts, still]
     if has_poses:
@@ -293,12 +294,13 @@ def _explanations(
 
     best, is_crowd = best_motion(pairs, *starts, steps=8), torch.zeros(len(none), dtype=torch.bool)
     if has_poses and pairs.by_flow:  # what fits a crowd is no evidence against recorded motion
-        is_crowd = fit.fits_a_crowd(pairs, residual(pairs, best))
+        is_crowd = fit.fits_a_crowd(pairs, residuals(pairs, best))
         best = torch.where(is_crowd[:, None, None], pairs.motion, best)
     recorded, others = fitted(pairs, best, has_poses), []
-    if has_poses and recorded.left < (_EXACT_PX if pairs.by_flow else INTERPOLATED_PX):
+    if has_poses and recorded.residual_px < (_EXACT_PX if pairs.by_flow else INTERPOLATED_PX):
         return recorded, []
-    left = median(px_of(residual(few, pairs.motion if has_poses else recorded.motion)))
+    motion = pairs.motion if has_poses else recorded.motion
+    recorded_px = median(quantile_px(residuals(few, motion)))
     for rival in rivals if has_poses else [rival for rival in rivals if rival.of != "poses"]:
         n = _learnt(few, rival, recorded.motion)
         if n is None:
@@ -308,13 +310,13 @@ def _explanations(
             motion = best_motion(changed, still, motion)
         elif rival.of != "poses":
             # Except for poses, a correction with larger residuals than the data is no explanation.
-            few_left = residual(changed.of(pixels=slice(fit.FITTED)), changed.motion)
-            if not median(px_of(few_left)) <= left:
+            few_changed = changed.select(pixels=slice(fit.FITTED))
+            if not median(quantile_px(residuals(few_changed, changed.motion))) <= recorded_px:
                 continue
             motion = best_motion(changed, changed.motion)
         other = fitted(changed, motion, has_poses, rival, n)
         if is_crowd.any():  # nor is a rival that fits it
-            is_its = is_crowd & fit.fits_a_crowd(pairs, residual(changed, motion))
+            is_its = is_crowd & fit.fits_a_crowd(pairs, residuals(changed, motion))
             other = replace(other, spread=other.spread.masked_fill(is_its, math.inf))
         others.append(other)
     return recorded, others
@@ -326,12 +328,12 @@ def fitted(
 ) -> _Fit:  # fmt: skip
     """Returns what pairs leave by the best motion, of a rival with its numbers `[P, k]`."""
     # A rival may need a pose beyond the recording's ends: what it leaves there is unknown.
-    none, error = pairs.depth[:, :0], apart(pairs, pairs.motion, motion)
+    none, error = pairs.depth[:, :0], difference_px(pairs, pairs.motion, motion)
     if not has_poses:  # the best motion is as good as any
         error = torch.zeros_like(error)
     rival = rival or Rival("poses", "", "", lambda pairs, n: pairs)
     n = none if n is None else n
-    spread = spread_of(residual(pairs, motion))
+    spread = spread_of(residuals(pairs, motion))
     return _Fit(rival, n.nanmedian(0).values, pairs, motion, error, spread)
 
 
@@ -351,9 +353,10 @@ def _learnt(few: Pairs, rival: Rival, best: Tensor) -> Tensor | None:
     for start in rival.start:
         n = best.new_tensor(start).expand(int(group.max()) + 1, k)
         known = None if few.has_poses else best
-        motion, n = fit.descended(few, known, rival.change, n, group, steps=7)
-        left = px_of(residual(rival.change(few, n[group]), motion)).nan_to_num(math.inf)
-        tries.append((n, [float(left[half == i].median()) for i in half.unique()]))
+        motion, n = fit.gauss_newton(few, known, rival.change, n, group, steps=7)
+        residuals_px = residuals(rival.change(few, n[group]), motion)
+        each_px = quantile_px(residuals_px).nan_to_num(math.inf)
+        tries.append((n, [float(each_px[half == i].median()) for i in half.unique()]))
     if rival.each:  # (of the frame, of the one before): each from the other pair that it is in
         follows = (few.path[1:, 1] == few.path[:-1, 2]).flatten(1).all(1)
         if not follows.any():
@@ -392,17 +395,17 @@ def _other_times(recorded: _Fit, raw_px: float) -> str:
     of_depth = recorded.pairs._replace(by_flow=False, scale_px=0.5)
     still = EYE.expand_as(recorded.motion)
     motion = best_motion(of_depth, still, recorded.motion)  # at rest, no pixel leaves the picture
-    px = median(apart(recorded.pairs, motion, recorded.motion))
+    px = median(difference_px(recorded.pairs, motion, recorded.motion))
     known = (recorded.motion, motion, recorded.pairs.motion)
-    by_flow, after, by_poses = (px_of(residual(of_depth, each), 0.5) for each in known)
+    by_flow, after, by_poses = (quantile_px(residuals(of_depth, each), 0.5) for each in known)
     # The flow's own noise is amplified where depth hardly tells motions apart, as on a floor. If
     # depth agrees with poses that flow agrees with, it is of one time.
     before = by_flow.minimum(by_poses.nan_to_num(math.inf))
     if px < _UNSURE * raw_px or median(before) < INTERPOLATED_PX or not is_better(after, before):
         return ""
     # A crowd that walks one way may be all that depth shows to move. Its flow then fits, too.
-    left = residual(recorded.pairs, torch.stack(known[:2]))
-    shares = fit.agreement(recorded.pairs, left).mean(-1)
+    residuals_px = residuals(recorded.pairs, torch.stack(known[:2]))
+    shares = fit.agreement(recorded.pairs, residuals_px).mean(-1)
     if median(shares[1] / shares[0]) > _CROWD:
         return ""
     return f"depth moves otherwise than flow, by {px:.2g} px of {raw_px:.2g} px: is it of one time?"
@@ -417,46 +420,46 @@ def _about_depth(pairs: Pairs, motion: Tensor) -> tuple[str, list[str]]:
         notes.append(f"{share:.0%} of depth is {farthest:.4g} m: if that is no surface, say so")
     if not pairs.by_flow:
         return "", notes
-    off_share, wrapped_share = _off(pairs, motion, farthest)
+    outlier_share, wrapped_share = _outlier_shares(pairs, motion, farthest)
     if wrapped_share > _WRAPPED_SHARE:
         why = f"{wrapped_share:.0%} of the pixels fit if {farthest:.5g} m are added to depth"
         why += ": it wraps around there, as 16 bits of millimetres do at 65.536 m"
         if wrapped_share > _MANY_WRAPPED:
             return why, notes
         notes.append(why)
-    if off_share > _OFF_SHARE:
-        notes.append(f"{off_share:.0%} of pixels don't fit: they move, or depth is wrong there")
+    if outlier_share > _OFF_SHARE:
+        notes.append(f"{outlier_share:.0%} of pixels don't fit: they move, or depth is wrong there")
     return "", notes
 
 
-def _off(pairs: Pairs, motion: Tensor, farthest: float) -> tuple[float, float]:
+def _outlier_shares(pairs: Pairs, motion: Tensor, farthest: float) -> tuple[float, float]:
     """Returns the share of pixels that don't fit, and of those whose depth has wrapped around.
 
-    These fit if the largest depth is added to theirs, and the nearest pixels border on the
-    farthest. Moving pixels may fit by chance, but have no such edges.
+    A pixel has wrapped if it fits with the largest depth added, in a picture where the nearest
+    pixels border on the farthest. Moving pixels may fit by chance, but have no such edges.
     """
-    left, farther = (
-        residual(each, motion).square().sum(-2)
+    squared, farther = (
+        residuals(each, motion).square().sum(-2)
         for each in (pairs, pairs._replace(depth=pairs.depth + farthest))
     )
-    most = (_OFF * fit.scale_of(left, pairs)).clamp(min=_OFF_PX).square().unsqueeze(-1)
-    off, number = left > most, left.isfinite().sum()
+    most = (_OFF * fit.scale_of(squared, pairs)).clamp(min=_OFF_PX).square().unsqueeze(-1)
+    is_outlier, number = squared > most, squared.isfinite().sum()
     side = pairs.now.reciprocal() / farthest
     side = ((side > 0.9) & (side <= 1)).long() - ((side > 0) & (side < 0.1)).long()
     edges = sum(int((side.diff(dim=dim).abs() == 2).sum()) for dim in (1, 2))
     wraps = edges > _WRAPPED_EDGES * side.numel()
-    wrapped = off & (farther < most) & wraps
-    return float(off.sum() / number), float(wrapped.sum() / number)
+    has_wrapped = is_outlier & (farther < most) & wraps
+    return float(is_outlier.sum() / number), float(has_wrapped.sum() / number)
 
 
 def _unseen(pairs: Pairs, rivals: Sequence[Rival], least: float) -> tuple[str, ...]:
     """Returns the corrections whose usual mistake would not change the residuals here."""
-    pairs, unseen = pairs.of(pixels=slice(fit.FITTED)), []
-    now = residual(pairs, pairs.motion, plain=True)
+    pairs, unseen = pairs.select(pixels=slice(fit.FITTED)), []
+    now = residuals(pairs, pairs.motion, plain=True)
     for rival in rivals:
         if len(rival.usual) == len(rival.start[0]):
             other = rival.change(pairs, now.new_tensor(rival.usual).expand(len(now), -1))
-            if median(px_of(residual(other, other.motion, plain=True) - now)) <= least:
+            if median(quantile_px(residuals(other, other.motion, plain=True) - now)) <= least:
                 unseen.append(rival.typed.partition("={")[0].partition("=[")[0].partition(" {")[0])
     return tuple(unseen)
 
@@ -485,31 +488,31 @@ def _mapped(pairs: Pairs, best: Tensor) -> Tensor:
     for damping in (0.03, 0.3, 3.0):
         learnt = torch.linalg.solve_ex(A + damping * size * torch.eye(7), b)[0]
         correction = (x.unsqueeze(-2) @ learnt).squeeze(-2) / unit
-        errors.append(apart(pairs, fit.small_motion(recorded + correction), best))
+        errors.append(difference_px(pairs, fit.small_motion(recorded + correction), best))
     return min(errors, key=median)
 
 
-def _smoothed(pairs: Pairs, best: Tensor) -> Tensor:
-    """Returns what the best motion leaves without its structure over picture and depth, px `[P]`.
+def _without_trend(pairs: Pairs, best: Tensor) -> Tensor:
+    """Returns the spread of the best motion's residuals without their trend, px `[P]`.
 
     A polynomial in the pixel's position and inverse depth is fitted to every other block of the
-    picture and subtracted in the others. Where K, depth and flow fit, only noise is left.
+    picture and subtracted in the others. Where K, depth and flow fit, only noise remains.
     """
-    left, (height, width) = residual(pairs, best), pairs.now.shape[-2:]
+    residuals_px, (height, width) = residuals(pairs, best), pairs.now.shape[-2:]
     x, y = (2 * pairs.pixel.nan_to_num() / torch.tensor([[width], [height]]) - 1).unbind(1)
     q = pairs.depth.reciprocal().nan_to_num(0.0, 0.0, 0.0).clamp(min=0.0)
     q = (q / q.median(-1, keepdim=True).values.clamp(min=1e-9)).clamp(max=3.0) - 1
     powers = [(a, b, c) for a in range(4) for b in range(4 - a) for c in range(3)]
     terms = torch.stack([x**a * y**b * q**c for a, b, c in powers], -1)
-    is_even, out = _every_other(pairs, 5, 4), left
+    is_even, out = _every_other(pairs, 5, 4), residuals_px
     for half in (is_even, ~is_even):
-        known = half & left.isfinite().all(1)
+        known = half & residuals_px.isfinite().all(1)
         weight = known.double()
         for _ in range(4):
             weighted = terms * weight.unsqueeze(-1)
-            A, b = weighted.mT @ terms, weighted.mT @ left.nan_to_num().mT
+            A, b = weighted.mT @ terms, weighted.mT @ residuals_px.nan_to_num().mT
             A = A + torch.diag_embed(1e-3 * A.diagonal(dim1=-2, dim2=-1) + 1e-9)
-            rest = left - (terms @ torch.linalg.solve_ex(A, b)[0]).mT
+            rest = residuals_px - (terms @ torch.linalg.solve_ex(A, b)[0]).mT
             squared = torch.where(known, rest.square().sum(1), math.nan)
             scale = fit.scale_of(squared, pairs).square().unsqueeze(-1)
             weight = (1 + squared / scale).square().reciprocal().nan_to_num()
