@@ -114,7 +114,7 @@ def diagnosed(
     Args:
         starts: motions `[P, 4, 4]` that the best one may be near to.
         names: the frames'.
-        remedy: makes what the user types of `Rival.typed` and the pairs as they are then.
+        remedy: makes what the user types of `Rival.remedy` and the pairs as they are then.
         stand: the names of further frames, whose recorded standstill the data contradict.
     """
     recorded, others = _explanations(pairs, starts, rivals)
@@ -288,8 +288,8 @@ def _explanations(
     still = EYE.expand(len(none), 4, 4)
     starts = [*starts, still]
     if has_poses:
-        known = [r.change(pairs, none).motion for r in rivals if r.of == "poses" and not r.start[0]]
-        known = [pairs.motion, *known]
+        of_poses = [r for r in rivals if r.subject == "poses" and not r.start[0]]
+        known = [pairs.motion, *(rival.change(pairs, none).motion for rival in of_poses)]
         starts = [pairs.motion, fit.least_costly(pairs, torch.stack(known)), *starts]
 
     best, is_crowd = best_motion(pairs, *starts, steps=8), torch.zeros(len(none), dtype=torch.bool)
@@ -301,14 +301,14 @@ def _explanations(
         return recorded, []
     motion = pairs.motion if has_poses else recorded.motion
     recorded_px = median(quantile_px(residuals(few, motion)))
-    for rival in rivals if has_poses else [rival for rival in rivals if rival.of != "poses"]:
+    for rival in rivals if has_poses else [rival for rival in rivals if rival.subject != "poses"]:
         n = _learnt(few, rival, recorded.motion)
         if n is None:
             continue
         changed, motion = rival.change(pairs, n), recorded.motion
         if not has_poses:
             motion = best_motion(changed, still, motion)
-        elif rival.of != "poses":
+        elif rival.subject != "poses":
             # Except for poses, a correction with larger residuals than the data is no explanation.
             few_changed = changed.select(pixels=slice(fit.FITTED))
             if not median(quantile_px(residuals(few_changed, changed.motion))) <= recorded_px:
@@ -349,7 +349,7 @@ def _learnt(few: Pairs, rival: Rival, best: Tensor) -> Tensor | None:
         return None
     every, tries = torch.arange(count), []
     half = every % 2 if count >= 4 else 0 * every
-    group = every if rival.each else half
+    group = every if rival.per_pair else half
     for start in rival.start:
         n = best.new_tensor(start).expand(int(group.max()) + 1, k)
         known = None if few.has_poses else best
@@ -357,7 +357,7 @@ def _learnt(few: Pairs, rival: Rival, best: Tensor) -> Tensor | None:
         residuals_px = residuals(rival.change(few, n[group]), motion)
         each_px = quantile_px(residuals_px).nan_to_num(math.inf)
         tries.append((n, [float(each_px[half == i].median()) for i in half.unique()]))
-    if rival.each:  # (of the frame, of the one before): each from the other pair that it is in
+    if rival.per_pair:  # (of the frame, of the one before): each from the other pair that it is in
         follows = (few.path[1:, 1] == few.path[:-1, 2]).flatten(1).all(1)
         if not follows.any():
             return None
@@ -369,7 +369,7 @@ def _learnt(few: Pairs, rival: Rival, best: Tensor) -> Tensor | None:
         n = torch.stack(halves)[half.max() - half]
     if rival.in_pixels:
         n = (n * few.now.shape[-1]).round() / few.now.shape[-1]
-    first, most = best.new_tensor(rival.start[0]), _LARGEST_FACTORS.get(rival.of, math.inf)
+    first, most = best.new_tensor(rival.start[0]), _LARGEST_FACTORS.get(rival.subject, math.inf)
     factors = n[:, first != 0] / first[first != 0]
     return n if bool(((factors > 1 / most) & (factors < most)).all()) else None
 
@@ -386,8 +386,8 @@ def _able(others: Sequence[_Fit], before: Tensor, noise: Tensor, raw_px: float) 
     enough = min(_CLEARLY * after[able[0]] + able[0].floor, error / _CLEARLY)
     able = [each for each in ranked if after[each] <= enough]
     # Of several corrections of one kind, the one with the fewest fitted numbers is kept.
-    fewest = {each.rival.of: len(each.n) for each in sorted(able, key=lambda e: -len(e.n))}
-    return [each for each in able if len(each.n) == fewest[each.rival.of]]
+    fewest = {each.rival.subject: len(each.n) for each in sorted(able, key=lambda e: -len(e.n))}
+    return [each for each in able if len(each.n) == fewest[each.rival.subject]]
 
 
 def _other_times(recorded: _Fit, raw_px: float) -> str:
@@ -460,7 +460,7 @@ def _unseen(pairs: Pairs, rivals: Sequence[Rival], least: float) -> tuple[str, .
         if len(rival.usual) == len(rival.start[0]):
             other = rival.change(pairs, now.new_tensor(rival.usual).expand(len(now), -1))
             if median(quantile_px(residuals(other, other.motion, plain=True) - now)) <= least:
-                unseen.append(rival.typed.partition("={")[0].partition("=[")[0].partition(" {")[0])
+                unseen.append(rival.remedy.partition("={")[0].partition("=[")[0].partition(" {")[0])
     return tuple(unseen)
 
 
