@@ -23,16 +23,21 @@ from flowrep.diagnosis.fit import (
     sampled,
     seen_before,
 )
-from flowrep.diagnosis.recordings import STANDS, left_out, nothing, why_not
+from flowrep.diagnosis.recordings import FROZEN, no_diagnosis, note_on_untested, reasons_untestable
 from flowrep.diagnosis.rivals import rivals_of
 from flowrep.diagnosis.verdict import Diagnosis, diagnosed, is_better
 
 _PAIRS = 8
-_BODIES, _MOVED_PX, _FEW_PIXELS = 24, 0.25, 32  # in pairs of frames, that show
-_FEW_FRAMES = 3  # of a body
+# A body counts once in each frame that shows it.
+_BODIES = 24  # that are tested at most, to save time
+_MOVED_PX = 0.25  # least flow or residual of a body that is tested: with less, it is at rest
+_FEW_PIXELS = 32  # least pixels of a body that is tested
+_FEW_FRAMES = 3  # least frames of a body that is tested
 _MUCH = 0.2  # of the picture: id 0 is then the static world, if no motions tell
 _ROUND = 0.05  # of a body's flow: depth between pixels is less exact where bodies are round
-_SAME_PX, _SAME_SHARE = 0.02, 0.01  # of flow that was computed twice
+# Flow that is computed again differs by rounding: by these pixels, and by this share of its length.
+_SAME_PX = 0.02
+_SAME_SHARE = 0.01
 _ADAPTERS = {
     "pose_layout": "AdaptPose", "pose_direction": "AdaptPose", "pose_axes": "AdaptPose",
     "depth_kind": "AdaptDepth", "near_m": "AdaptDepth", "far_m": "AdaptDepth",
@@ -48,9 +53,9 @@ def diagnose(
 ) -> Diagnosis:  # fmt: skip
     """Returns the diagnosis of an env's rollout or of a replay batch.
 
-    The depth of the frame before is the witness, since raw flow that comes from recorded motions
-    agrees with them whatever they are; raw flow itself, where it was measured. What transforms
-    wrote is computed again from what they read.
+    The reference is raw flow if it was measured, else the depth of the previous frame: raw flow
+    that comes from recorded motions agrees with them even if they are wrong. What transforms wrote
+    is computed again from what they read.
 
     Args:
         frames: successive frames `[*B, T]`, or steps `[*B]` in any order with their "next". Holds
@@ -91,19 +96,19 @@ def diagnose(
         raw, picture = seen.raw, seen.now["sensor"].get("rgb", None)
     maps = (static, seen.before, seen.K, seen.prev_K, torch.stack(path, 1), picture)
     pairs = sampled(raw, *maps)
-    reasons = why_not(pairs)
+    reasons = reasons_untestable(pairs)
     names = [str(index) for index in kept.tolist()]
-    able = torch.tensor([i for i, why in enumerate(reasons) if not why], dtype=torch.long)
-    if not len(able):
-        return nothing(reasons)
-    able = able[_spread(len(able), _PAIRS)]
+    testable = torch.tensor([i for i, why in enumerate(reasons) if not why], dtype=torch.long)
+    if not len(testable):
+        return no_diagnosis(reasons)
+    testable = testable[_spread(len(testable), _PAIRS)]
     rivals = rivals_of({}, by_flow=is_measured, of_flow=is_measured, absolute=is_absolute)
-    stand = [name for name, why in zip(names, reasons) if why == STANDS]
-    named = [names[i] for i in able.tolist()]
-    result = diagnosed(pairs.select(able), [], rivals, named, _call, stand)
+    frozen = [name for name, why in zip(names, reasons) if why == FROZEN]
+    names = [names[i] for i in testable.tolist()]
+    result = diagnosed(pairs.select(testable), [], rivals, names, _adapter_call, frozen)
     faults, odd = _recomputed(seen, ego_key, obj_key)
     kind, of_bodies = ("", "") if result.is_wrong else _bodies(seen, pairs.depth_step)
-    odd += left_out(reasons, sum(not why for why in reasons))
+    odd += note_on_untested(reasons, sum(not why for why in reasons))
     odd += [of_bodies] * (kind == "untested")
     result = replace(result, notes=(*result.notes, *odd))
     if faults := [*faults, *[of_bodies] * (kind == "fault")]:
@@ -191,7 +196,7 @@ def _recomputed(seen: _Seen, ego_key: str, obj_key: str) -> tuple[list[str], lis
     of_poses, raw = ego, seen.flow.flow if seen.raw is None else seen.raw
     if seen.poses is not None:
         of_poses = seen.flow_of(geometry.relative_motion(*seen.poses, dtype=torch.float64)).flow
-    for says, given, right in (
+    for description, given, right in (
         ("row 0 of instance_motion isn't prev_from_curr", seen.flow_of(seen.rows[:, 0]).flow, ego),
         ("prev_from_curr isn't the motion of world_from_cam", ego, of_poses),
         (f"{ego_key} isn't the flow of depth, K and prev_from_curr", seen.now.get(ego_key), ego),
@@ -211,17 +216,17 @@ def _recomputed(seen: _Seen, ego_key: str, obj_key: str) -> tuple[list[str], lis
         if px <= _SAME_PX + _SAME_SHARE * size_px:
             continue
         if 1e-3 < factor < 1e3 and as_factor_px < px / 20:
-            odd.append(f"{says}, but {factor:.3g} times that (a scale, or px/s)")
+            odd.append(f"{description}, but {factor:.3g} times that (a scale, or px/s)")
         else:
-            faults.append(f"{says} ({px:.2g} px off)")
+            faults.append(f"{description} ({px:.2g} px off)")
     return faults, odd
 
 
 def _bodies(seen: _Seen, depth_step: float) -> tuple[str, str]:
     """Returns "fault", "untested", "doubt" or "" of bodies' ids and motions, and the reason.
 
-    Each body of each frame is judged as the camera is: by what its motion leaves of the depth of
-    the frame before, on the body's pixels, and by what the best motion would leave there.
+    Each body of each frame is judged as the camera is: by the residuals of its motion on the body's
+    pixels, with the depth of the previous frame as reference, and by those of the best motion.
     """
     count, ids = seen.rows.shape[1], seen.ids[:, 0]
     unseen = "no moving body is seen: ids and motions of bodies are not tested"
@@ -282,11 +287,11 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[str, str]:
     return "", ""
 
 
-def _call(typed: str, _: Pairs) -> str:
+def _adapter_call(remedy: str, _: Pairs) -> str:
     """Returns the call of the adapter that has these options; other texts are unchanged."""
-    options = dict(option.partition("=")[::2] for option in typed.split(" "))
+    options = dict(option.partition("=")[::2] for option in remedy.split(" "))
     if not options.keys() <= _ADAPTERS.keys():
-        return typed
+        return remedy
     adapter = _ADAPTERS[next(iter(options))]
     if adapter == "AdaptFlow":  # it has no defaults
         options = {"flow_direction": "forward", "flow_grid": "current"} | options

@@ -14,15 +14,16 @@ from flowrep.geometry.egomotion import structure_tensor
 from flowrep.geometry.pose import relative_motion, rotation_from_vector
 
 EYE = torch.eye(4, dtype=torch.float64)
-PIXELS, FITTED = 1000, 400  # of a pair, and of these, those that motions and numbers are fitted to
-_LEAST_TEXTURE = 0.25  # of a structure tensor's trace, 0 to 2
+PIXELS = 1000  # that represent a pair
+FITTED = 400  # of these, that motions and numbers are fitted to: fits compute residuals often
+_LEAST_TEXTURE = 0.25  # of a structure tensor's trace, 0 to 2: with less, flow is a guess
 _BEHIND_PX = 1e3  # residual of a point that a motion puts behind the camera
-_STEP = 1e-6  # of numeric derivatives
+_STEP = 1e-6  # of numeric derivatives in float64, in radians, metres, or a change's numbers
 # Interpolated depth is exact on planes only: on round bodies, right data have residuals of 0.02 px.
 INTERPOLATED_PX = 0.04
-PARTS = 6, 4  # columns and rows of a picture, in which noise evens out and bodies don't
-_DEARER = 5.0  # weight of a pixel that no longer agrees, relative to one that begins to agree
-_SETTLED = 0.01  # a smaller step ends the descent: root of all pixels' squares, in scales
+PARTS = 6, 4  # columns and rows of a picture, in which noise averages out and bodies don't
+_LOST_PIXEL_WEIGHT = 5.0  # of a pixel that no longer agrees, relative to one that begins to agree
+_STEP_TOLERANCE = 0.01  # the fit ends with steps that change the residuals' norm by fewer scales
 
 
 class Pairs(NamedTuple):
@@ -279,7 +280,7 @@ def gauss_newton(
         n = n - step[free * count :].view_as(n)
         if motion is not None:
             motion = small_motion(-step[: free * count].view(count, 6).clamp(-0.5, 0.5)) @ motion
-        if in_units.abs().amax() < _SETTLED:
+        if in_units.abs().amax() < _STEP_TOLERANCE:
             break
     return change(pairs, n[group]).motion if motion is None else motion, n
 
@@ -323,7 +324,7 @@ def fits_a_crowd(pairs: Pairs, residuals_px: Tensor) -> Tensor:
     column, row = parts(pairs, *PARTS)
     gained = torch.zeros(agree.shape[1], math.prod(PARTS), dtype=torch.float64)
     gained.scatter_add_(-1, column + PARTS[0] * row, agree[1] - agree[0])
-    return (gained - _DEARER * (-gained).clamp(min=0)).sum(-1) < 0
+    return (gained - _LOST_PIXEL_WEIGHT * (-gained).clamp(min=0)).sum(-1) < 0
 
 
 def agreement(pairs: Pairs, residuals_px: Tensor) -> Tensor:
