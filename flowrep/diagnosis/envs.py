@@ -264,11 +264,11 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[str, str]:
     residuals_px = residuals(pairs, pairs.motion)
     moved_px, residual_px = quantile_px(at - at_rest), quantile_px(residuals_px, 0.5)
     number = residuals_px.isfinite().sum((1, 2))
-    tells = (torch.maximum(moved_px, residual_px) >= _MOVED_PX) & (number >= _FEW_PIXELS)
-    if int(tells.sum()) < _FEW_FRAMES:
+    testable = (torch.maximum(moved_px, residual_px) >= _MOVED_PX) & (number >= _FEW_PIXELS)
+    if int(testable.sum()) < _FEW_FRAMES:
         return "untested", unseen
-    pairs, body, still = pairs.select(tells), body[tells], still[tells]
-    residual_px, moved_px = residual_px[tells], moved_px[tells]
+    pairs, body, still = pairs.select(testable), body[testable], still[testable]
+    residual_px, moved_px = residual_px[testable], moved_px[testable]
     best_px = quantile_px(residuals(pairs, best_motion(pairs, pairs.motion, still)), 0.5)
     at_rest_px = quantile_px(residuals(pairs, still), 0.5)
     least = INTERPOLATED_PX + _ROUND * moved_px
@@ -278,8 +278,8 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[str, str]:
         is_off = int(rows.sum()) >= _FEW_FRAMES and median((residual_px - least)[rows]) > 0
         if is_off and is_better(best_px[rows], residual_px[rows]):
             px, flow, best = (median(each[rows]) for each in (residual_px, moved_px, best_px))
-            why = f"instance_motion or ids don't fit {name}: {px:.2g} px are left"
-            why += f" (flow: {flow:.2g} px), and a motion exists that would leave {best:.2g} px"
+            why = f"instance_motion or ids don't fit {name}: the residual is {px:.2g} px"
+            why += f" (flow: {flow:.2g} px), with the best motion it would be {best:.2g} px"
             return "fault", why
     # A flat body that moves aside changes no depth: it might as well be at rest.
     if int((at_rest_px > least).sum()) < _FEW_FRAMES:

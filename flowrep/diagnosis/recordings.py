@@ -19,7 +19,7 @@ from flowrep.diagnosis.verdict import Diagnosis, diagnosed, fitted
 _LEAST_PIXELS = 64
 _LEAST_MOVEMENT_PX = 0.25
 _MANY_UNTESTED = 0.2  # of all pairs: a note then gives their number
-FROZEN = "the recorded motion stands still, depth doesn't"
+FROZEN = "the recorded camera doesn't move, but depth changes"
 
 
 @dataclass
@@ -49,7 +49,7 @@ class Examination:
         Args:
             raw: `[2, H, W]`, pixels, nan where unknown.
             earlier: world_from_cam `[4, 4]` of the frame before `previous`; as `later`, of that
-                after `current`, it tells whether poses are late.
+                after `current`, it shows whether poses are late.
         """
         flow, now, before = (torch.as_tensor(x)[None] for x in (raw, current.depth, previous.depth))
         K, prev_K = (torch.as_tensor(frame.K)[None] for frame in (current, previous))
@@ -107,9 +107,9 @@ def reasons_untestable(pairs: Pairs) -> list[str]:
     ego = quantile_px(pairs.pixel - seen_before(pairs, pairs.motion)[0]).nan_to_num(0.0)
     moves = torch.maximum(quantile_px(pairs.raw).nan_to_num(0.0), ego) >= _LEAST_MOVEMENT_PX
     number, has_depth = (~pairs.depth.isnan()).sum(-1), pairs.now.isfinite().flatten(1).any(1)
-    tells = has_depth & (number >= _LEAST_PIXELS)
+    is_known = has_depth & (number >= _LEAST_PIXELS)
     # If the camera stands still, depth doesn't change.
-    still, frozen = (tells & ~moves).nonzero()[:, 0], torch.zeros_like(moves)
+    still, frozen = (is_known & ~moves).nonzero()[:, 0], torch.zeros_like(moves)
     if len(still) and pairs.has_poses:
         few = pairs.select(still, slice(FITTED))._replace(by_flow=False, scale_px=0.5)
         rest = fitted(few, best_motion(few, few.motion), few.has_poses)

@@ -151,7 +151,7 @@ def diagnosed(
     is_doubtful = pairs.is_estimated and best_px > _DOUBTFUL * raw_px + _DOUBTFUL_PX
     first = explanations[0] if explanations else None
     if is_doubtful and (not first or len(first.n)):  # numbers fitted to such flow explain nothing
-        why = f"flow estimated from the pictures fits no motion: {best_px:.2g} px are left"
+        why = f"flow estimated from the pictures fits no motion: the residual is {best_px:.2g} px"
         return Diagnosis("can't tell", why, **numbers)
     enough = max(2 * first.least, error / _SEVERAL) if first else 0.0
     if first and median(first.beyond(noise)) < enough and not first.is_unexplained:
@@ -160,7 +160,7 @@ def diagnosed(
     exceeds_noise |= error > max(_TIMES_THE_NOISE * median(recorded.spread), _LITTLE * raw_px)
     if first or recorded.is_unexplained or (exceeds_noise and error > least):
         why = f"the error is {size}, and none of {len(rivals)} known mistakes explains it"
-        why += f"; a motion exists that would leave {best_px:.2g} px" if pairs.has_poses else ""
+        why += f"; the best motion has a residual of {best_px:.2g} px" if pairs.has_poses else ""
         why += f"; nearest: {ways}" if first else ""
         return Diagnosis("something is wrong", why, **numbers)
     if pairs.by_flow and (why := _depth_of_another_time(recorded, raw_px)):
@@ -191,7 +191,7 @@ def diagnosed(
     if not pairs.has_poses:
         notes.append("poses and the unit of depth are not tested")
     elif best_px < numbers["left_px"] / 2 and error > raw_px / 10:
-        notes.append("the poses are rough: motion estimated from flow and depth leaves less")
+        notes.append("the poses are rough: motion estimated from flow and depth fits better")
     parts = "raw flow, " * pairs.by_flow + "depth, K" + ", the camera's motion" * pairs.has_poses
     agree = f"{parts} agree to {size}, beside noise of {best_px:.2g} px"
     unseen = _unseen(pairs, rivals, max(least, error)) if pairs.has_poses else ()
@@ -395,10 +395,10 @@ def _explanations(
     after = {each: median(each.beyond(noise)) for each in others}
     error, ranked = median(before), sorted(others, key=lambda each: after[each])
     most = min(error, _EXPLAINED * raw_px) if error > _LARGE * raw_px else error / _SEVERAL
-    able = [each for each in ranked if after[each] < most and is_better(each.beyond(noise), before)]
-    if not able:
+    good = [each for each in ranked if after[each] < most and is_better(each.beyond(noise), before)]
+    if not good:
         return []
-    enough = min(_CLEARLY * after[able[0]] + able[0].floor, error / _CLEARLY)
+    enough = min(_CLEARLY * after[good[0]] + good[0].floor, error / _CLEARLY)
     alike = [each for each in ranked if after[each] <= enough]
     # Of several corrections of one subject, those with the fewest fitted numbers are kept.
     fewest = {each.rival.subject: len(each.n) for each in sorted(alike, key=lambda e: -len(e.n))}
@@ -424,7 +424,8 @@ def _depth_of_another_time(recorded: _Fit, raw_px: float) -> str:
     shares = fit.agreement(recorded.pairs, residuals_px).mean(-1)
     if median(shares[1] / shares[0]) > _CROWD:
         return ""
-    return f"depth moves otherwise than flow, by {px:.2g} px of {raw_px:.2g} px: is it of one time?"
+    size = f"{px:.2g} px apart (flow: {raw_px:.2g} px)"
+    return f"depth and flow fit different motions, {size}: were they recorded at the same time?"
 
 
 def _about_depth(pairs: Pairs, motion: Tensor) -> tuple[str, list[str]]:
