@@ -14,8 +14,8 @@ from flowrep.geometry.egomotion import structure_tensor
 from flowrep.geometry.pose import relative_motion, rotation_from_vector
 
 EYE = torch.eye(4, dtype=torch.float64)
-PIXELS = 1000  # that represent a pair
-FITTED = 400  # of these, that motions and numbers are fitted to: fits compute residuals often
+PIXELS = 1000  # that are sampled from each pair
+FITTED = 400  # of these: motions and numbers are fitted to fewer pixels, to save time
 _LEAST_TEXTURE = 0.25  # of a structure tensor's trace, 0 to 2: with less, flow is a guess
 _BEHIND_PX = 1e3  # residual of a point that a motion puts behind the camera
 _STEP = 1e-6  # of numeric derivatives in float64, in radians, metres, or a change's numbers
@@ -23,7 +23,7 @@ _STEP = 1e-6  # of numeric derivatives in float64, in radians, metres, or a chan
 INTERPOLATED_PX = 0.04
 PARTS = 6, 4  # columns and rows of a picture, in which noise averages out and bodies don't
 _LOST_PIXEL_WEIGHT = 5.0  # of a pixel that no longer agrees, relative to one that begins to agree
-_STEP_TOLERANCE = 0.01  # the fit ends with steps that change the residuals' norm by fewer scales
+_STEP_TOLERANCE = 0.01  # a fit ends when its step changes the residuals' norm by fewer scales
 
 
 class Pairs(NamedTuple):
@@ -43,7 +43,7 @@ class Pairs(NamedTuple):
     is_estimated: bool  # whether flow was estimated from pictures
     depth_step: float  # of coarse depth, metres
     scale_px: float  # the least scale of residuals
-    focal_px: float  # the recorded one: the unit of depth's residuals, whatever K a rival tries
+    focal_px: float  # as recorded: residuals of depth are in it, whatever K a rival tries
     gain: Tensor = torch.eye(2, dtype=torch.float64)  # [(P,) 2, 2], raw is this times flow
     distortion: Tensor = torch.zeros(1, 1, dtype=torch.float64)  # [P, 1], of the radius' square
 
@@ -331,7 +331,7 @@ def agreement(pairs: Pairs, residuals_px: Tensor) -> Tensor:
     """Returns the agreement `[M, P, N]`, 0 to 1, with M motions of residuals `[M, P, C, N]`.
 
     By depth alone, neither an interpolated edge nor a pixel that the first motion moves out of the
-    picture is a reason to leave the first.
+    picture is a reason to prefer another motion.
     """
     squared = residuals_px.square().sum(-2)
     scale = torch.stack([scale_of(each, pairs) for each in squared]).amin(0).square().unsqueeze(-1)

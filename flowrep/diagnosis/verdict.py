@@ -35,8 +35,8 @@ _ROUGH_WIDTHS = 1 / 1280
 # ... but none that exceed both a multiple of the flow's noise and a share of the flow's length.
 _TIMES_THE_NOISE = 20.0
 _LITTLE = 0.02
-# If the best motion leaves more than this share of estimated flow plus these pixels, the estimator
-# has failed.
+# The estimator of flow has failed if the residual of the best motion is more than the sum of this
+# share of the flow's length and these pixels.
 _DOUBTFUL = 0.15
 _DOUBTFUL_PX = 0.15
 # The poses of a pair are outliers if their error is more than both of these.
@@ -121,7 +121,7 @@ def diagnosed(
 
     Args:
         starts: motions `[P, 4, 4]` that the best one may be near to.
-        names: the frames'.
+        names: the names of the frames.
         instruction: tells the user what to do, given `Rival.remedy` and the corrected pairs.
         frozen: the names of further frames, whose recorded standstill the data contradict.
     """
@@ -238,9 +238,9 @@ class _Fit:
 
     @cached_property
     def halves(self) -> tuple[list[Pairs], list[Tensor]]:
-        """The pairs with every other block of pixels, those with the other blocks; best motions.
+        """The pairs with either half of their pixels, and the best motions of each.
 
-        The halves consist of blocks, since neighbouring pixels have similar errors.
+        A half is every other block of the picture, since neighbouring pixels have similar errors.
         """
         pairs, is_even = self.pairs, _every_other(self.pairs, *fit.PARTS)
         halves = [
@@ -254,7 +254,7 @@ class _Fit:
         """The errors where they are no noise, else 0.
 
         They are no noise if the best motion is better for pixels to which it was not fitted: in
-        most pairs, or else in a pair's both halves.
+        most pairs, or else in both halves of a pair.
         """
         if not self.pairs.has_poses:
             return self.error
