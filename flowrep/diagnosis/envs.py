@@ -27,14 +27,14 @@ from flowrep.diagnosis.recordings import FROZEN, no_diagnosis, note_on_untested,
 from flowrep.diagnosis.rivals import rivals_of
 from flowrep.diagnosis.verdict import Diagnosis, diagnosed, is_better
 
-_PAIRS = 8
-# A body counts once in each frame that shows it.
+_PAIRS = 8  # that are tested at most, to save time
+# A body counts in each frame that shows it.
 _BODIES = 24  # that are tested at most, to save time
 _MOVED_PX = 0.25  # least flow or residual of a body that is tested: with less, it is at rest
 _FEW_PIXELS = 32  # least pixels of a body that is tested
 _FEW_FRAMES = 3  # least frames of a body that is tested
-_MUCH = 0.2  # of the picture: id 0 is then the static world, if no motions tell
-_ROUND = 0.05  # of a body's flow: depth between pixels is less exact where bodies are round
+_WORLD_SHARE = 0.2  # of the picture: with more of id 0, it is the world if motions are unknown
+_ROUND = 0.05  # of a body's flow: interpolated depth is less exact where bodies are round
 # Flow that is computed again differs by rounding: by these pixels, and by this share of its length.
 _SAME_PX = 0.02
 _SAME_SHARE = 0.01
@@ -157,7 +157,7 @@ def _successive(frames: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase,
 
 
 class _Seen:
-    """What an env recorded of P frames and of those before them, and the flow that follows."""
+    """What an env recorded of P frames and of the previous ones, and the flow that follows."""
 
     def __init__(self, now: Any, previous: Any, K: Tensor, prev_K: Tensor, raw_key: str) -> None:
         self.now, self.K, self.prev_K, self.motion = now, K.double(), prev_K.double(), _motion(now)
@@ -174,7 +174,7 @@ class _Seen:
         stands = (self.rows - self.rows[:, :1]).abs().flatten(2).amax(-1) < 1e-6
         self.is_static = stands.gather(1, rows.flatten(1)).view_as(rows)
         is_world = (self.ids == 0) & self.depth.isfinite()
-        if not self.has_rows and is_world.double().mean() > _MUCH:
+        if not self.has_rows and is_world.double().mean() > _WORLD_SHARE:
             self.is_static = self.ids == 0
         self.flow = geometry.rigid_flow(self.depth, rows, self.K, self.rows, prev_K=self.prev_K)
         self.ego = self.flow_of(self.motion)
@@ -251,7 +251,7 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[str, str]:
     depth = torch.where(known[frame] == of_body, seen.depth[frame, 0], math.nan)
     before, nearest = seen.before[frame], depth.nan_to_num(math.inf).amin((1, 2), keepdim=True)
     is_body = seen.ids_before[frame, 0] == of_body
-    # Between a body's edge and the next pixel nothing is known, nor where something hides it.
+    # Depth is unknown between a body's edge and the next pixel, and where something hides the body.
     around = functional.max_pool2d(is_body.float(), 3, 1, 1) > 0
     other = torch.where(around | (before < 0.9 * nearest), math.nan, math.inf)
     before = torch.where(is_body, before, other)
@@ -279,7 +279,7 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[str, str]:
         if is_off and is_better(best_px[rows], residual_px[rows]):
             px, flow, best = (median(each[rows]) for each in (residual_px, moved_px, best_px))
             why = f"instance_motion or ids don't fit {name}: the residual is {px:.2g} px"
-            why += f" (flow: {flow:.2g} px), with the best motion it would be {best:.2g} px"
+            why += f" (flow: {flow:.2g} px), and {best:.2g} px with the best motion"
             return "fault", why
     # A flat body that moves aside changes no depth: it might as well be at rest.
     if int((at_rest_px > least).sum()) < _FEW_FRAMES:

@@ -17,7 +17,7 @@ from flowrep.diagnosis.verdict import Diagnosis, diagnosed, fitted
 
 # Pairs with fewer known pixels or less flow are not tested: they tell nothing.
 _LEAST_PIXELS = 64
-_LEAST_MOVEMENT_PX = 0.25
+_LEAST_MOVEMENT_PX = 0.25  # median length of flow
 _MANY_UNTESTED = 0.2  # of all pairs: a note then gives their number
 FROZEN = "the recorded camera doesn't move, but depth changes"
 
@@ -108,7 +108,7 @@ def reasons_untestable(pairs: Pairs) -> list[str]:
     moves = torch.maximum(quantile_px(pairs.raw).nan_to_num(0.0), ego) >= _LEAST_MOVEMENT_PX
     number, has_depth = (~pairs.depth.isnan()).sum(-1), pairs.now.isfinite().flatten(1).any(1)
     is_known = has_depth & (number >= _LEAST_PIXELS)
-    # If the camera stands still, depth doesn't change.
+    # While a camera stands still, depth doesn't change.
     still, frozen = (is_known & ~moves).nonzero()[:, 0], torch.zeros_like(moves)
     if len(still) and pairs.has_poses:
         few = pairs.select(still, slice(FITTED))._replace(by_flow=False, scale_px=0.5)

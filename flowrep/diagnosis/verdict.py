@@ -371,7 +371,7 @@ def _fitted_numbers(few: Pairs, rival: Rival, best: Tensor) -> Tensor | None:
         each_px = quantile_px(residuals_px).nan_to_num(math.inf)
         tries.append((n, [float(each_px[half == i].median()) for i in half.unique()]))
     if rival.per_pair:
-        # A frame's number is fitted to the other pair that it is in, as its previous or current.
+        # A frame's number is taken from the fit to the other pair that has this frame.
         follows = (few.path[1:, 1] == few.path[:-1, 2]).flatten(1).all(1)
         if not follows.any():
             return None
