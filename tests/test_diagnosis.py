@@ -428,7 +428,7 @@ def test_every_adapter_that_is_printed_for_an_env_can_be_made():
     names = {adapter.__name__: adapter for adapter in adapters} | {"K": torch.eye(3)}
     rivals = rivals_of({}, by_flow=True, of_flow=True, absolute=True)
     texts = [rival.texts(torch.tensor(rival.start[0]), width=64)[0] for rival in rivals]
-    calls = {text: diagnosis.envs._call(text, None) for text in texts}
+    calls = {text: diagnosis.envs._adapter_call(text, None) for text in texts}
     made = [eval(call, names) for call in calls.values() if call.startswith("Adapt")]
     assert {*map(type, made)} == {*adapters}
     # two options of one pose are arguments of one transform, or it would be converted twice
@@ -438,7 +438,7 @@ def test_every_adapter_that_is_printed_for_an_env_can_be_made():
     assert calls["pose_lag_frames=1"] == "pose_lag_frames=1"
 
 
-def test_flow_that_was_measured_is_a_witness_of_its_own(frames):
+def test_flow_that_was_measured_is_a_reference_of_its_own(frames):
     found = spoilt(frames, raw=lambda flow: -flow)
     assert "flow_direction=backward" in found.suspects
     assert "AdaptFlow" in found.words

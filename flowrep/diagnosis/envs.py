@@ -18,21 +18,26 @@ from flowrep.diagnosis.fit import (
     Pairs,
     best_motion,
     median,
-    px_of,
-    residual,
+    quantile_px,
+    residuals,
     sampled,
     seen_before,
 )
-from flowrep.diagnosis.recordings import STANDS, left_out, nothing, why_not
+from flowrep.diagnosis.recordings import FROZEN, no_diagnosis, note_on_untested, reasons_untestable
 from flowrep.diagnosis.rivals import rivals_of
 from flowrep.diagnosis.verdict import Diagnosis, diagnosed, is_better
 
-_PAIRS = 8
-_BODIES, _MOVED_PX, _FEW_PIXELS = 24, 0.25, 32  # in pairs of frames, that show
-_FEW_FRAMES = 3  # of a body
-_MUCH = 0.2  # of the picture: id 0 is then the static world, if no motions tell
-_ROUND = 0.05  # of a body's flow: depth between pixels is less exact where bodies are round
-_SAME_PX, _SAME_SHARE = 0.02, 0.01  # of flow that was computed twice
+_PAIRS = 8  # that are tested at most, to save time
+# A body counts in each frame that shows it.
+_BODIES = 24  # that are tested at most, to save time
+_MOVED_PX = 0.25  # least flow or residual of a body that is tested: with less, it is at rest
+_FEW_PIXELS = 32  # least pixels of a body that is tested
+_FEW_FRAMES = 3  # least frames of a body that is tested
+_WORLD_SHARE = 0.2  # of the picture: with more of id 0, it is the world if motions are unknown
+_ROUND = 0.05  # of a body's flow: interpolated depth is less exact where bodies are round
+# Flow that is computed again differs by rounding: by these pixels, and by this share of its length.
+_SAME_PX = 0.02
+_SAME_SHARE = 0.01
 _ADAPTERS = {
     "pose_layout": "AdaptPose", "pose_direction": "AdaptPose", "pose_axes": "AdaptPose",
     "depth_kind": "AdaptDepth", "near_m": "AdaptDepth", "far_m": "AdaptDepth",
@@ -48,9 +53,9 @@ def diagnose(
 ) -> Diagnosis:  # fmt: skip
     """Returns the diagnosis of an env's rollout or of a replay batch.
 
-    The depth of the frame before is the witness, since raw flow that comes from recorded motions
-    agrees with them whatever they are; raw flow itself, where it was measured. What transforms
-    wrote is computed again from what they read.
+    The reference is raw flow if it was measured, else the depth of the previous frame: raw flow
+    that comes from recorded motions agrees with them even if they are wrong. What transforms wrote
+    is computed again from what they read.
 
     Args:
         frames: successive frames `[*B, T]`, or steps `[*B]` in any order with their "next". Holds
@@ -91,19 +96,19 @@ def diagnose(
         raw, picture = seen.raw, seen.now["sensor"].get("rgb", None)
     maps = (static, seen.before, seen.K, seen.prev_K, torch.stack(path, 1), picture)
     pairs = sampled(raw, *maps)
-    reasons = why_not(pairs)
+    reasons = reasons_untestable(pairs)
     names = [str(index) for index in kept.tolist()]
-    able = torch.tensor([i for i, why in enumerate(reasons) if not why], dtype=torch.long)
-    if not len(able):
-        return nothing(reasons)
-    able = able[_spread(len(able), _PAIRS)]
+    testable = torch.tensor([i for i, why in enumerate(reasons) if not why], dtype=torch.long)
+    if not len(testable):
+        return no_diagnosis(reasons)
+    testable = testable[_spread(len(testable), _PAIRS)]
     rivals = rivals_of({}, by_flow=is_measured, of_flow=is_measured, absolute=is_absolute)
-    stand = [name for name, why in zip(names, reasons) if why == STANDS]
-    named = [names[i] for i in able.tolist()]
-    result = diagnosed(pairs.of(able), [], rivals, named, _call, stand)
+    frozen = [name for name, why in zip(names, reasons) if why == FROZEN]
+    names = [names[i] for i in testable.tolist()]
+    result = diagnosed(pairs.select(testable), [], rivals, names, _adapter_call, frozen)
     faults, odd = _recomputed(seen, ego_key, obj_key)
     kind, of_bodies = ("", "") if result.is_wrong else _bodies(seen, pairs.depth_step)
-    odd += left_out(reasons, sum(not why for why in reasons))
+    odd += note_on_untested(reasons, sum(not why for why in reasons))
     odd += [of_bodies] * (kind == "untested")
     result = replace(result, notes=(*result.notes, *odd))
     if faults := [*faults, *[of_bodies] * (kind == "fault")]:
@@ -152,7 +157,7 @@ def _successive(frames: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase,
 
 
 class _Seen:
-    """What an env recorded of P frames and of those before them, and the flow that follows."""
+    """What an env recorded of P frames and of the previous ones, and the flow that follows."""
 
     def __init__(self, now: Any, previous: Any, K: Tensor, prev_K: Tensor, raw_key: str) -> None:
         self.now, self.K, self.prev_K, self.motion = now, K.double(), prev_K.double(), _motion(now)
@@ -169,7 +174,7 @@ class _Seen:
         stands = (self.rows - self.rows[:, :1]).abs().flatten(2).amax(-1) < 1e-6
         self.is_static = stands.gather(1, rows.flatten(1)).view_as(rows)
         is_world = (self.ids == 0) & self.depth.isfinite()
-        if not self.has_rows and is_world.double().mean() > _MUCH:
+        if not self.has_rows and is_world.double().mean() > _WORLD_SHARE:
             self.is_static = self.ids == 0
         self.flow = geometry.rigid_flow(self.depth, rows, self.K, self.rows, prev_K=self.prev_K)
         self.ego = self.flow_of(self.motion)
@@ -178,7 +183,7 @@ class _Seen:
             valid = now.get(f"{raw_key}_valid", torch.ones_like(self.flow.valid))
             self.raw = torch.where(valid, self.raw.double(), math.nan)
             expected = torch.where(self.flow.valid, self.flow.flow, math.nan)
-            self.is_derived = not median(px_of((self.raw - expected).flatten(2))) > 0.01
+            self.is_derived = not median(quantile_px((self.raw - expected).flatten(2))) > 0.01
 
     def flow_of(self, motion: Tensor) -> geometry.Flow:
         """Returns the flow of a static world."""
@@ -191,7 +196,7 @@ def _recomputed(seen: _Seen, ego_key: str, obj_key: str) -> tuple[list[str], lis
     of_poses, raw = ego, seen.flow.flow if seen.raw is None else seen.raw
     if seen.poses is not None:
         of_poses = seen.flow_of(geometry.relative_motion(*seen.poses, dtype=torch.float64)).flow
-    for says, given, right in (
+    for description, given, right in (
         ("row 0 of instance_motion isn't prev_from_curr", seen.flow_of(seen.rows[:, 0]).flow, ego),
         ("prev_from_curr isn't the motion of world_from_cam", ego, of_poses),
         (f"{ego_key} isn't the flow of depth, K and prev_from_curr", seen.now.get(ego_key), ego),
@@ -211,17 +216,17 @@ def _recomputed(seen: _Seen, ego_key: str, obj_key: str) -> tuple[list[str], lis
         if px <= _SAME_PX + _SAME_SHARE * size_px:
             continue
         if 1e-3 < factor < 1e3 and as_factor_px < px / 20:
-            odd.append(f"{says}, but {factor:.3g} times that (a scale, or px/s)")
+            odd.append(f"{description}, but {factor:.3g} times that (a scale, or px/s)")
         else:
-            faults.append(f"{says} ({px:.2g} px off)")
+            faults.append(f"{description} ({px:.2g} px off)")
     return faults, odd
 
 
 def _bodies(seen: _Seen, depth_step: float) -> tuple[str, str]:
     """Returns "fault", "untested", "doubt" or "" of bodies' ids and motions, and the reason.
 
-    Each body of each frame is judged as the camera is: by what its motion leaves of the depth of
-    the frame before, on the body's pixels, and by what the best motion would leave there.
+    Each body of each frame is judged as the camera is: by the residuals of its motion on the body's
+    pixels, with the depth of the previous frame as reference, and by those of the best motion.
     """
     count, ids = seen.rows.shape[1], seen.ids[:, 0]
     unseen = "no moving body is seen: ids and motions of bodies are not tested"
@@ -246,7 +251,7 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[str, str]:
     depth = torch.where(known[frame] == of_body, seen.depth[frame, 0], math.nan)
     before, nearest = seen.before[frame], depth.nan_to_num(math.inf).amin((1, 2), keepdim=True)
     is_body = seen.ids_before[frame, 0] == of_body
-    # Between a body's edge and the next pixel nothing is known, nor where something hides it.
+    # Depth is unknown between a body's edge and the next pixel, and where something hides the body.
     around = functional.max_pool2d(is_body.float(), 3, 1, 1) > 0
     other = torch.where(around | (before < 0.9 * nearest), math.nan, math.inf)
     before = torch.where(is_body, before, other)
@@ -256,23 +261,25 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[str, str]:
     pairs = pairs._replace(depth_step=depth_step, coarseness=depth_step / pairs.depth)
     still = seen.motion[frame]
     at, at_rest = (seen_before(pairs, motion)[0] for motion in (pairs.motion, still))
-    moved_px, left = px_of(at - at_rest), px_of(residual(pairs, pairs.motion), 0.5)
-    number = residual(pairs, pairs.motion).isfinite().sum((1, 2))
-    tells = (torch.maximum(moved_px, left) >= _MOVED_PX) & (number >= _FEW_PIXELS)
-    if int(tells.sum()) < _FEW_FRAMES:
+    residuals_px = residuals(pairs, pairs.motion)
+    moved_px, residual_px = quantile_px(at - at_rest), quantile_px(residuals_px, 0.5)
+    number = residuals_px.isfinite().sum((1, 2))
+    testable = (torch.maximum(moved_px, residual_px) >= _MOVED_PX) & (number >= _FEW_PIXELS)
+    if int(testable.sum()) < _FEW_FRAMES:
         return "untested", unseen
-    pairs, left, moved_px, body = pairs.of(tells), left[tells], moved_px[tells], body[tells]
-    best = px_of(residual(pairs, best_motion(pairs, pairs.motion, still[tells])), 0.5)
-    at_rest_px = px_of(residual(pairs, still[tells]), 0.5)
+    pairs, body, still = pairs.select(testable), body[testable], still[testable]
+    residual_px, moved_px = residual_px[testable], moved_px[testable]
+    best_px = quantile_px(residuals(pairs, best_motion(pairs, pairs.motion, still)), 0.5)
+    at_rest_px = quantile_px(residuals(pairs, still), 0.5)
     least = INTERPOLATED_PX + _ROUND * moved_px
-    for says, of in (
+    for name, rows in (
         ("the bodies", body > 0), *((f"body {i}", body == i) for i in body.unique().tolist())
     ):  # fmt: skip
-        is_off = int(of.sum()) >= _FEW_FRAMES and median(left[of] - least[of]) > 0
-        if is_off and is_better(best[of], left[of]):
-            size = f"{median(left[of]):.2g} px are left (flow: {median(moved_px[of]):.2g} px)"
-            why = f"instance_motion or ids don't fit {says}: {size}"
-            why += f", and a motion exists that would leave {median(best[of]):.2g} px"
+        is_off = int(rows.sum()) >= _FEW_FRAMES and median((residual_px - least)[rows]) > 0
+        if is_off and is_better(best_px[rows], residual_px[rows]):
+            px, flow, best = (median(each[rows]) for each in (residual_px, moved_px, best_px))
+            why = f"instance_motion or ids don't fit {name}: the residual is {px:.2g} px"
+            why += f" (flow: {flow:.2g} px), and {best:.2g} px with the best motion"
             return "fault", why
     # A flat body that moves aside changes no depth: it might as well be at rest.
     if int((at_rest_px > least).sum()) < _FEW_FRAMES:
@@ -280,11 +287,11 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[str, str]:
     return "", ""
 
 
-def _call(typed: str, _: Pairs) -> str:
+def _adapter_call(remedy: str, _: Pairs) -> str:
     """Returns the call of the adapter that has these options; other texts are unchanged."""
-    options = dict(option.partition("=")[::2] for option in typed.split(" "))
+    options = dict(option.partition("=")[::2] for option in remedy.split(" "))
     if not options.keys() <= _ADAPTERS.keys():
-        return typed
+        return remedy
     adapter = _ADAPTERS[next(iter(options))]
     if adapter == "AdaptFlow":  # it has no defaults
         options = {"flow_direction": "forward", "flow_grid": "current"} | options

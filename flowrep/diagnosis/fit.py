@@ -1,4 +1,4 @@
-"""How far camera motions are from explaining pairs of frames, in pixels, and the nearest motion."""
+"""Residuals of camera motions on pairs of frames, and the motion with the smallest residuals."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ from flowrep.geometry.egomotion import structure_tensor
 from flowrep.geometry.pose import relative_motion, rotation_from_vector
 
 EYE = torch.eye(4, dtype=torch.float64)
-PIXELS, FITTED = 1000, 400  # of a pair, and of these, those that motions and numbers are fitted to
-_LEAST_TEXTURE = 0.25  # of a structure tensor's trace, 0 to 2
+PIXELS = 1000  # that are sampled from each pair
+FITTED = 400  # of these: motions and numbers are fitted to fewer pixels, to save time
+_LEAST_TEXTURE = 0.25  # of a structure tensor's trace, 0 to 2: with less, flow is a guess
 _BEHIND_PX = 1e3  # residual of a point that a motion puts behind the camera
-_STEP = 1e-6  # of numeric derivatives
+_STEP = 1e-6  # of numeric derivatives in float64, in radians, metres, or a change's numbers
 # Interpolated depth is exact on planes only: on round bodies, right data have residuals of 0.02 px.
 INTERPOLATED_PX = 0.04
-PARTS = 6, 4  # columns and rows of a picture, in which noise evens out and bodies don't
-_DEARER = 5.0  # weight of a pixel that no longer agrees, relative to one that begins to agree
-_SETTLED = 0.01  # a smaller step ends the descent: root of all pixels' squares, in scales
+PARTS = 6, 4  # columns and rows of a picture, in which noise averages out and bodies don't
+_LOST_PIXEL_WEIGHT = 5.0  # of a pixel that no longer agrees, relative to one that begins to agree
+_STEP_TOLERANCE = 0.01  # a fit ends when its step changes the residuals' norm by fewer scales
 
 
 class Pairs(NamedTuple):
@@ -38,22 +39,22 @@ class Pairs(NamedTuple):
     path: Tensor  # [P, 4, 4, 4], world_from_cam at t - 2 to t + 1
     now: Tensor  # [P, H, W], inverse depth of the current frame
     before: Tensor  # the same of the previous one
-    by_flow: bool  # the witness is raw flow, not the depth of the frame before
-    is_estimated: bool  # from pictures
+    by_flow: bool  # whether the reference is raw flow, not the depth of the previous frame
+    is_estimated: bool  # whether flow was estimated from pictures
     depth_step: float  # of coarse depth, metres
-    scale_px: float  # the least scale of what is left
-    focal_px: float  # the recorded one: errors of depth are in it, whatever K a rival tries
+    scale_px: float  # the least scale of residuals
+    focal_px: float  # as recorded: residuals of depth are in it, whatever K a rival tries
     gain: Tensor = torch.eye(2, dtype=torch.float64)  # [(P,) 2, 2], raw is this times flow
     distortion: Tensor = torch.zeros(1, 1, dtype=torch.float64)  # [P, 1], of the radius' square
 
-    def of(self, pairs: Any = slice(None), pixels: Any = slice(None)) -> Pairs:
-        """Returns some pairs, or some of each one's pixels."""
+    def select(self, pairs: Any = slice(None), pixels: Any = slice(None)) -> Pairs:
+        """Returns some of the pairs, with some of their pixels."""
         maps = [tensor[pairs][..., pixels] for tensor in self[:5]]
         return Pairs._make([*maps, *(tensor[pairs] for tensor in self[5:10]), *self[10:]])
 
     @staticmethod
     def joined(parts: Sequence[Pairs]) -> Pairs:
-        """Returns the pairs of all parts; of depth's steps the largest counts."""
+        """Returns the pairs of all parts, with the largest of their depth steps."""
         maps = [torch.cat(tensors) for tensors in zip(*(part[:10] for part in parts))]
         pairs = Pairs._make([*maps, *parts[0][10:]])
         return pairs._replace(depth_step=max(part.depth_step for part in parts))
@@ -78,12 +79,14 @@ def sampled(
     raw: Tensor | None, now: Tensor, before: Tensor, K: Tensor, prev_K: Tensor, path: Tensor,
     picture: Tensor | None = None,
 ) -> Pairs:  # fmt: skip
-    """Returns pairs of maps `[P, ..., H, W]`: pixels that are known, spread evenly.
+    """Returns pairs sampled from maps `[P, ..., H, W]`, at known pixels that are spread evenly.
 
-    With a picture, raw flow is of pixels with texture: elsewhere an estimator gives 0 or a guess.
+    With a picture, flow counts as known where there is texture: elsewhere, an estimator gives 0 or
+    a guess.
     """
     count, width, size = len(now), now.shape[-1], now.shape[-2] * now.shape[-1]
-    step = int(size / 1.618033988749895) + 1  # coprime steps of the golden ratio meet each once
+    # Steps of the golden ratio spread evenly, and visit each pixel once if coprime to the size.
+    step = int(size / 1.618033988749895) + 1
     while math.gcd(step, size) > 1:
         step += 1
     index = torch.arange(min(size, 8 * PIXELS)) * step % size
@@ -109,7 +112,7 @@ def sampled(
         maps = torch.where(known.unsqueeze(1), maps, math.nan)
         return maps.gather(-1, order.unsqueeze(1).expand(-1, maps.shape[1], -1))
 
-    values = depth[depth.isfinite()].unique()  # there are few of 8 or 16 bits
+    values = depth[depth.isfinite()].unique()  # few, if depth was stored in 8 or 16 bits
     is_coarse = 1 < len(values) < 0.1 * depth.numel()
     depth_step = float(values.diff().median()) if is_coarse else 0.0
     z = first(depth.unsqueeze(1)).squeeze(1)
@@ -124,20 +127,20 @@ def sampled(
 
 
 def seen_before(pairs: Pairs, motion: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns where pixels were before, `[..., P, 2, N]`, and their depth then over that now."""
+    """Returns positions in the previous frame, `[..., P, 2, N]`, and depth there over that now."""
     rays = torch.linalg.inv_ex(pairs.K)[0] @ homogeneous(pairs.pixel)
-    bent, by = bool(pairs.distortion.any()), pairs.distortion[..., None]
-    if bent:
+    is_distorted, k1 = bool(pairs.distortion.any()), pairs.distortion[..., None]
+    if is_distorted:
         straight = rays[:, :2]
         for _ in range(6):
-            straight = rays[:, :2] / (1 + by * straight.square().sum(1, keepdim=True)).clamp(0.2)
+            straight = rays[:, :2] / (1 + k1 * straight.square().sum(1, keepdim=True)).clamp(0.2)
         rays = homogeneous(straight)
     q = torch.where(pairs.depth > 0, pairs.depth.reciprocal(), math.nan).unsqueeze(-2)
     moved = motion[..., :3, :3] @ rays + motion[..., :3, 3:] * q
     ratio = torch.where(moved[..., 2, :] > 0.01, moved[..., 2, :], math.nan)
     at = moved[..., :2, :] / ratio.unsqueeze(-2)
-    if bent:
-        at = at * (1 + by * at.square().sum(-2, keepdim=True))
+    if is_distorted:
+        at = at * (1 + k1 * at.square().sum(-2, keepdim=True))
     return pairs.prev_K[:, :2, :2] @ at + pairs.prev_K[:, :2, 2:], ratio
 
 
@@ -146,31 +149,32 @@ def homogeneous(points: Tensor) -> Tensor:
     return functional.pad(points, (0, 0, 0, 1), value=1.0)
 
 
-def residual(pairs: Pairs, motion: Tensor, *, plain: bool = False) -> Tensor:
-    """Returns what a motion `[..., P, 4, 4]` leaves, px `[..., P, 2 or 1, N]`, nan where unknown.
+def residuals(pairs: Pairs, motion: Tensor, *, plain: bool = False) -> Tensor:
+    """Returns the residuals of a motion `[..., P, 4, 4]`, px `[..., P, 2 or 1, N]`, nan if unknown.
 
-    With flow, only directions that have texture count, unless `plain`. With depth, it is how far a
-    surface at 45 degrees would have to move to explain the difference, less the depth's step.
+    The residual of flow is raw flow minus the motion's flow; of estimated flow, only directions
+    with texture count, unless `plain`. The residual of depth is how far a surface at 45 degrees
+    would have to move to explain the difference between the two depths, minus the depth's step.
     """
     pixel, ratio = seen_before(pairs, motion)
     known = ~pairs.depth.isnan() & motion.isfinite().flatten(-2).all(-1, keepdim=True)
     if not pairs.by_flow:
-        left = looked_up(pairs.before, pixel) * pairs.depth * ratio - 1
-        left = left.sign() * (left.abs() - pairs.coarseness).clamp(min=0.0)
-        left = (pairs.focal_px * left).masked_fill(ratio.isnan(), _BEHIND_PX)
-        return torch.where(known & pairs.depth.isfinite(), left, math.nan).unsqueeze(-2)
-    left = (pairs.raw - pairs.gain @ (pairs.pixel - pixel)).nan_to_num(nan=_BEHIND_PX)
+        share = looked_up(pairs.before, pixel) * pairs.depth * ratio - 1
+        share = share.sign() * (share.abs() - pairs.coarseness).clamp(min=0.0)
+        residuals_px = (pairs.focal_px * share).masked_fill(ratio.isnan(), _BEHIND_PX)
+        return torch.where(known & pairs.depth.isfinite(), residuals_px, math.nan).unsqueeze(-2)
+    residuals_px = (pairs.raw - pairs.gain @ (pairs.pixel - pixel)).nan_to_num(nan=_BEHIND_PX)
     known = known & pairs.raw.isfinite().all(-2)
     if pairs.is_estimated and not plain:  # the texture is the picture's, whatever axes the flow has
         xx, xy, yy = pairs.texture.unbind(1)
-        u, v = (torch.linalg.inv(pairs.gain) @ left).unbind(-2)
-        left = torch.stack([xx * u + xy * v, xy * u + yy * v], -2)
-        left = left * pairs.gain.det().abs().sqrt()[..., None, None]
-    return torch.where(known.unsqueeze(-2), left, math.nan)
+        u, v = (torch.linalg.inv(pairs.gain) @ residuals_px).unbind(-2)
+        residuals_px = torch.stack([xx * u + xy * v, xy * u + yy * v], -2)
+        residuals_px = residuals_px * pairs.gain.det().abs().sqrt()[..., None, None]
+    return torch.where(known.unsqueeze(-2), residuals_px, math.nan)
 
 
 def looked_up(maps: Tensor, pixel: Tensor, mode: str = "bilinear") -> Tensor:
-    """Returns maps `[P, H, W]` at places `[..., P, 2, N]`, nan outside."""
+    """Returns maps `[P, H, W]` at positions `[..., P, 2, N]`, nan outside."""
     size = torch.tensor([maps.shape[-1], maps.shape[-2]], dtype=torch.float64).unsqueeze(-1)
     inside = ((pixel >= 0.5) & (pixel <= size - 0.5)).all(-2)
     grid = torch.where(inside.unsqueeze(-2), 2 * pixel / size - 1, 0.0)
@@ -179,28 +183,28 @@ def looked_up(maps: Tensor, pixel: Tensor, mode: str = "bilinear") -> Tensor:
     return torch.where(inside, values[:, 0].transpose(0, 1).reshape(inside.shape), math.nan)
 
 
-def px_of(left: Tensor, share: float | None = None) -> Tensor:
-    """Returns a quantile of each pair's lengths of what is left, `[..., P, C, N]`.
+def quantile_px(vectors_px: Tensor, share: float | None = None) -> Tensor:
+    """Returns a quantile of the lengths of each pair's vectors `[..., P, C, N]`.
 
     With flow, it is the median, since half of the picture may move by itself. With depth, of which
     only static pixels are given, it is the 0.8 quantile: along a road or a wall, most depths stay
     the same wherever the camera is, so the median would be near 0 for wrong motions, too.
     """
-    share = share or (0.5 if left.shape[-2] == 2 else 0.8)
-    return left.square().sum(-2).sqrt().nanquantile(share, -1, interpolation="lower")
+    share = share or (0.5 if vectors_px.shape[-2] == 2 else 0.8)
+    return vectors_px.square().sum(-2).sqrt().nanquantile(share, -1, interpolation="lower")
 
 
-def spread_of(left: Tensor) -> Tensor:
-    """Returns the median that residuals of noise alone would have, by their lower third."""
-    if left.shape[-2] == 1:
-        return px_of(left)
-    return math.sqrt(math.log(2) / math.log(1.5)) * px_of(left, 1 / 3)
+def spread_of(residuals_px: Tensor) -> Tensor:
+    """Returns the median that residuals of noise alone would have, from their lower third."""
+    if residuals_px.shape[-2] == 1:
+        return quantile_px(residuals_px)
+    return math.sqrt(math.log(2) / math.log(1.5)) * quantile_px(residuals_px, 1 / 3)
 
 
-def apart(pairs: Pairs, one: Tensor, other: Tensor) -> Tensor:
-    """Returns the difference between what two motions leave, which has no noise, px `[P]`."""
-    left = residual(pairs, one, plain=True) - residual(pairs, other, plain=True)
-    return px_of(left, None if pairs.by_flow else 0.95)
+def difference_px(pairs: Pairs, one: Tensor, other: Tensor) -> Tensor:
+    """Returns the difference between the residuals of two motions, which has no noise, px `[P]`."""
+    vectors_px = residuals(pairs, one, plain=True) - residuals(pairs, other, plain=True)
+    return quantile_px(vectors_px, None if pairs.by_flow else 0.95)
 
 
 def median(values: Tensor) -> float:
@@ -216,7 +220,7 @@ def small_motion(step: Tensor) -> Tensor:
 
 
 def motion_vector(motion: Tensor) -> Tensor:
-    """Returns (rotation vector, translation) `[..., 6]` of turns well below half of one."""
+    """Returns (rotation vector, translation) `[..., 6]` of rotations well below 180 degrees."""
     sine = skew_part(motion[..., :3, :3]) / 2
     length, trace = sine.norm(dim=-1, keepdim=True), motion.diagonal(dim1=-2, dim2=-1).sum(-1)
     angle = torch.atan2(length, (trace.unsqueeze(-1) - 2) / 2)
@@ -233,14 +237,15 @@ def skew_part(R: Tensor) -> Tensor:
 Change = Callable[[Pairs, Tensor], Pairs]  # of pairs, with numbers [P, k]
 
 
-def descended(
+def gauss_newton(
     pairs: Pairs, motion: Tensor | None, change: Change, n: Tensor, group: Tensor, *, steps: int
 ) -> tuple[Tensor, Tensor]:
-    """Returns motions, and the numbers `[G, k]` of a change, that leave less: Gauss-Newton steps.
+    """Returns motions, and the numbers `[G, k]` of a change, with smaller residuals.
 
-    Weights are Geman and McClure's. Without `motion`, the recorded motions are kept.
+    The residuals are weighted as Geman and McClure do.
 
     Args:
+        motion: where the fit of motions starts; None keeps the recorded ones and fits n alone.
         group: `[P]`, the row of n that is a pair's.
     """
     count, (_, k) = len(group), n.shape
@@ -253,21 +258,21 @@ def descended(
     for _ in range(steps):
         changed = change(pairs, n[group])
         moved = changed.motion.unsqueeze(0) if motion is None else tries @ motion
-        left, *columns = residual(changed, moved)
-        for one in _STEP * torch.eye(k, dtype=torch.float64):
-            changed = change(pairs, n[group] + one)
-            columns.append(residual(changed, changed.motion if motion is None else motion))
-        J = (torch.stack(columns, -1) - left.unsqueeze(-1)) / _STEP  # [P, C, N, free + k]
-        known = (left.isfinite() & J.isfinite().all(-1)).all(-2)
-        squared = torch.where(known, left.square().sum(-2), math.nan)
+        residuals_px, *columns = residuals(changed, moved)
+        for delta in _STEP * torch.eye(k, dtype=torch.float64):
+            changed = change(pairs, n[group] + delta)
+            columns.append(residuals(changed, changed.motion if motion is None else motion))
+        J = (torch.stack(columns, -1) - residuals_px.unsqueeze(-1)) / _STEP  # [P, C, N, free + k]
+        known = (residuals_px.isfinite() & J.isfinite().all(-1)).all(-2)
+        squared = torch.where(known, residuals_px.square().sum(-2), math.nan)
         scale = scale_of(squared, pairs).square().unsqueeze(-1)
         root = (scale.rsqrt() / (1 + squared / scale)).unsqueeze(1)
-        left = torch.where(known.unsqueeze(1), left * root, 0.0).flatten(1)
+        residuals_px = torch.where(known.unsqueeze(1), residuals_px * root, 0.0).flatten(1)
         J = torch.where(known[:, None, :, None], J * root.unsqueeze(-1), 0.0).flatten(1, 2)
         A, b = torch.zeros(size, size).double(), torch.zeros(size).double()
         A.index_put_((index.unsqueeze(2), index.unsqueeze(1)), J.mT @ J, accumulate=True)
-        b.index_put_((index,), (J.mT @ left.unsqueeze(-1)).squeeze(-1), accumulate=True)
-        # In units of what each unknown moves, and damped where the pixels tell nothing.
+        b.index_put_((index,), (J.mT @ residuals_px.unsqueeze(-1)).squeeze(-1), accumulate=True)
+        # In units in which all unknowns change the residuals alike; damped where none does.
         unit = A.diagonal().clamp(min=1e-12).rsqrt()
         A = A * unit * unit.unsqueeze(-1) + 1e-6 * torch.eye(size)
         in_units = torch.linalg.solve_ex(A, b * unit)[0].nan_to_num()
@@ -275,59 +280,60 @@ def descended(
         n = n - step[free * count :].view_as(n)
         if motion is not None:
             motion = small_motion(-step[: free * count].view(count, 6).clamp(-0.5, 0.5)) @ motion
-        if in_units.abs().amax() < _SETTLED:
+        if in_units.abs().amax() < _STEP_TOLERANCE:
             break
     return change(pairs, n[group]).motion if motion is None else motion, n
 
 
 def scale_of(squared: Tensor, pairs: Pairs) -> Tensor:
-    """Returns 1.5 standard deviations of residuals by their lower third, their squares given."""
+    """Returns 1.5 standard deviations of residuals, from the lower third of their squares."""
     third = squared.nanquantile(1 / 3, -1, interpolation="lower")
     scale = 1.5 * (third / (-2 * math.log(2 / 3))).sqrt()
     return scale.nan_to_num(1.0, 1.0).clamp(pairs.scale_px, 1e4)
 
 
 def best_motion(pairs: Pairs, *starts: Tensor, steps: int = 5) -> Tensor:
-    """Returns the motions that leave least, from whichever start each is reached."""
-    few, motions = pairs.of(pixels=slice(FITTED)), [*starts]
-    nothing, nobody = torch.zeros(1, 0).double(), torch.zeros(len(few.K), dtype=torch.long)
+    """Returns each pair's motion with the smallest residuals, from whichever start leads to it."""
+    few, motions = pairs.select(pixels=slice(FITTED)), [*starts]
+    no_numbers, group = torch.zeros(1, 0).double(), torch.zeros(len(few.K), dtype=torch.long)
     # Edges of depth show the direction in the first round; interpolated, they don't count later.
     rounds = [few] if pairs.by_flow else [few, few._replace(scale_px=INTERPOLATED_PX)]
     for end in starts:
         for each in rounds:
-            end, _ = descended(each, end, lambda p, n: p, nothing, nobody, steps=steps)
+            end, _ = gauss_newton(each, end, lambda p, n: p, no_numbers, group, steps=steps)
         motions.append(end)
     return least_costly(rounds[-1], torch.stack(motions))
 
 
 def least_costly(pairs: Pairs, motions: Tensor) -> Tensor:
     """Returns that of motions `[M, P, 4, 4]` with which most pixels of each pair agree."""
-    agree = agreement(pairs, residual(pairs, motions)).mean(-1)
+    agree = agreement(pairs, residuals(pairs, motions)).mean(-1)
     return motions[agree.argmax(0), torch.arange(agree.shape[1])]
 
 
-def fits_a_crowd(pairs: Pairs, left: Tensor) -> Tensor:
-    """Returns in which pairs `[P]` a motion with residuals `left` gives up what the recorded fits.
+def fits_a_crowd(pairs: Pairs, residuals_px: Tensor) -> Tensor:
+    """Returns in which pairs `[P]` a motion with these residuals fits a crowd, not the world.
 
-    Where much of the picture moves, another motion may fit more pixels than the right one. It gives
-    up those that the right one fits, in whole parts of the picture. What corrects a wrong motion
-    gives up next to none: noise evens out over a part.
+    Where much of the picture moves, another motion may fit more pixels than the right one. It loses
+    those that the right one fits, in whole parts of the picture. A correction of a wrong motion
+    loses next to none: noise averages out over a part.
     """
-    first = residual(pairs, pairs.motion)
-    agree = agreement(pairs, torch.stack([first, torch.where(left.isnan(), first, left)]))
+    first = residuals(pairs, pairs.motion)
+    known_px = torch.where(residuals_px.isnan(), first, residuals_px)
+    agree = agreement(pairs, torch.stack([first, known_px]))
     column, row = parts(pairs, *PARTS)
     gained = torch.zeros(agree.shape[1], math.prod(PARTS), dtype=torch.float64)
     gained.scatter_add_(-1, column + PARTS[0] * row, agree[1] - agree[0])
-    return (gained - _DEARER * (-gained).clamp(min=0)).sum(-1) < 0
+    return (gained - _LOST_PIXEL_WEIGHT * (-gained).clamp(min=0)).sum(-1) < 0
 
 
-def agreement(pairs: Pairs, left: Tensor) -> Tensor:
+def agreement(pairs: Pairs, residuals_px: Tensor) -> Tensor:
     """Returns the agreement `[M, P, N]`, 0 to 1, with M motions of residuals `[M, P, C, N]`.
 
     By depth alone, neither an interpolated edge nor a pixel that the first motion moves out of the
-    picture is a reason to leave the first.
+    picture is a reason to prefer another motion.
     """
-    squared = left.square().sum(-2)
+    squared = residuals_px.square().sum(-2)
     scale = torch.stack([scale_of(each, pairs) for each in squared]).amin(0).square().unsqueeze(-1)
     agree = (1 / (1 + squared / scale)).nan_to_num(0.0)
     if not pairs.by_flow:

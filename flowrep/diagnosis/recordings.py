@@ -11,21 +11,15 @@ import torch
 from torch import Tensor
 
 from flowrep import geometry
-from flowrep.diagnosis.fit import (
-    EYE,
-    FITTED,
-    Pairs,
-    best_motion,
-    px_of,
-    sampled,
-    seen_before,
-)
+from flowrep.diagnosis.fit import EYE, FITTED, Pairs, best_motion, quantile_px, sampled, seen_before
 from flowrep.diagnosis.rivals import rivals_of
 from flowrep.diagnosis.verdict import Diagnosis, diagnosed, fitted
 
-_LEAST_PIXELS, _LEAST_MOVEMENT_PX = 64, 0.25  # pairs with less say nothing
-_MANY_LEFT_OUT = 0.2
-STANDS = "the recorded motion stands still, depth doesn't"
+# Pairs with fewer known pixels or less flow are not tested: they tell nothing.
+_LEAST_PIXELS = 64
+_LEAST_MOVEMENT_PX = 0.25  # median length of flow
+_MANY_UNTESTED = 0.2  # of all pairs: a note then gives their number
+FROZEN = "the recorded camera doesn't move, but depth changes"
 
 
 @dataclass
@@ -42,7 +36,7 @@ class Examination:
     flow_is_recorded: bool = True
     _seen: list[tuple[Pairs, Tensor, str]] = field(default_factory=list)  # motion, name
     _reasons: list[str] = field(default_factory=list)
-    _stand: list[str] = field(default_factory=list)
+    _frozen: list[str] = field(default_factory=list)
     _intervals_s: list[float] = field(default_factory=list)
 
     @torch.no_grad()
@@ -50,12 +44,12 @@ class Examination:
         self, previous: Any, current: Any, raw: Any, earlier: Any = None,
         later: Any = None,
     ) -> bool:  # fmt: skip
-        """Takes two `Frame`s and the raw flow between them; returns whether they tell something.
+        """Takes two `Frame`s and the raw flow between them; returns whether they can be tested.
 
         Args:
             raw: `[2, H, W]`, pixels, nan where unknown.
             earlier: world_from_cam `[4, 4]` of the frame before `previous`; as `later`, of that
-                after `current`, it tells whether poses are late.
+                after `current`, it shows whether poses are late.
         """
         flow, now, before = (torch.as_tensor(x)[None] for x in (raw, current.depth, previous.depth))
         K, prev_K = (torch.as_tensor(frame.K)[None] for frame in (current, previous))
@@ -66,10 +60,10 @@ class Examination:
         if current.rgb is not None and raw is not current.raw:
             picture = torch.as_tensor(current.rgb).movedim(-1, 0)[None]
         pairs = sampled(flow, now, before, K, prev_K, path[None], picture)
-        (why,) = why_not(pairs)
+        (why,) = reasons_untestable(pairs)
         if why:
             self._reasons.append(why)
-            self._stand += [current.name] * (why == STANDS)
+            self._frozen += [current.name] * (why == FROZEN)
             return False
         options: Any = {"prev_K": prev_K.float(), "picture": picture}
         motion = geometry.camera_motion(flow, now[:, None], K.float(), **options).prev_from_curr
@@ -82,69 +76,69 @@ class Examination:
     def diagnosis(self) -> Diagnosis:
         """Returns the diagnosis of all pairs so far."""
         if not self._seen:
-            return nothing(self._reasons)
+            return no_diagnosis(self._reasons)
         parts, motions, names = zip(*self._seen)
         options = {"by_flow": True, "of_flow": self.flow_is_recorded, "absolute": True}
         rivals = rivals_of(self.conventions, **options)
         pairs, starts = Pairs.joined(parts), [torch.cat(motions)]
-        result = diagnosed(pairs, starts, rivals, names, self._remedy, self._stand)
-        return replace(result, notes=(*result.notes, *left_out(self._reasons, len(names))))
+        result = diagnosed(pairs, starts, rivals, names, self._instruction, self._frozen)
+        return replace(result, notes=(*result.notes, *note_on_untested(self._reasons, len(names))))
 
-    def _remedy(self, typed: str, corrected: Pairs) -> str:
-        words, given = typed.split(" "), self.conventions
+    def _instruction(self, remedy: str, corrected: Pairs) -> str:
+        words, given = remedy.split(" "), self.conventions
         numbers = corrected.K[:, [0, 1, 0, 1], [0, 1, 2, 2]]
         is_one = bool((numbers.amax(0) - numbers.amin(0) < 0.05 * numbers.amax()).all())
-        if typed.startswith(("K ", "K's", "cx", "fx")) and is_one:
+        if remedy.startswith(("K ", "K's", "cx", "fx")) and is_one:
             listing = ",".join(f"{number:.5g}" for number in numbers.median(0).values.tolist())
-            typed = f"intrinsics=[{listing}] first_pixel_centre=0.5"
-        if typed.startswith("depth times ") and "depth_unit_m" in given:
-            typed = f"depth_unit_m={float(words[-1]) * float(given['depth_unit_m']):.3g}"
-        elif typed.endswith(" frames later") and self._intervals_s:
+            remedy = f"intrinsics=[{listing}] first_pixel_centre=0.5"
+        if remedy.startswith("depth times ") and "depth_unit_m" in given:
+            remedy = f"depth_unit_m={float(words[-1]) * float(given['depth_unit_m']):.3g}"
+        elif remedy.endswith(" frames later") and self._intervals_s:
             interval_s = sorted(self._intervals_s)[len(self._intervals_s) // 2]
-            typed = f"pose_offset_s={-float(words[1]) * interval_s:.3g}"
-        if "=" not in typed:
-            return typed
-        options = [f"format.{option}" for option in typed.split(" ")]
+            remedy = f"pose_offset_s={-float(words[1]) * interval_s:.3g}"
+        if "=" not in remedy:
+            return remedy
+        options = [f"format.{option}" for option in remedy.split(" ")]
         return " ".join(options if given else ["format=frames", *options])
 
 
-def why_not(pairs: Pairs) -> list[str]:
-    """Returns why a pair can't be tested, "" if it can, `STANDS` if depth denies a standstill."""
-    ego = px_of(pairs.pixel - seen_before(pairs, pairs.motion)[0]).nan_to_num(0.0)
-    moves = torch.maximum(px_of(pairs.raw).nan_to_num(0.0), ego) >= _LEAST_MOVEMENT_PX
+def reasons_untestable(pairs: Pairs) -> list[str]:
+    """Returns why each pair can't be tested, "" if it can, `FROZEN` if its depth shows movement."""
+    ego = quantile_px(pairs.pixel - seen_before(pairs, pairs.motion)[0]).nan_to_num(0.0)
+    moves = torch.maximum(quantile_px(pairs.raw).nan_to_num(0.0), ego) >= _LEAST_MOVEMENT_PX
     number, has_depth = (~pairs.depth.isnan()).sum(-1), pairs.now.isfinite().flatten(1).any(1)
-    tells = has_depth & (number >= _LEAST_PIXELS)
-    # A camera that stands still leaves depth as it is.
-    still, stands = (tells & ~moves).nonzero()[:, 0], torch.zeros_like(moves)
+    is_known = has_depth & (number >= _LEAST_PIXELS)
+    # While a camera stands still, depth doesn't change.
+    still, frozen = (is_known & ~moves).nonzero()[:, 0], torch.zeros_like(moves)
     if len(still) and pairs.has_poses:
-        few = pairs.of(still, slice(FITTED))._replace(by_flow=False, scale_px=0.5)
+        few = pairs.select(still, slice(FITTED))._replace(by_flow=False, scale_px=0.5)
         rest = fitted(few, best_motion(few, few.motion), few.has_poses)
-        stands[still] = rest.shown > max(rest.least, _LEAST_MOVEMENT_PX)
-    return [_reason(*each) for each in zip(*map(Tensor.tolist, (has_depth, number, moves, stands)))]
+        frozen[still] = rest.significant > max(rest.least, _LEAST_MOVEMENT_PX)
+    return [_reason(*each) for each in zip(*map(Tensor.tolist, (has_depth, number, moves, frozen)))]
 
 
-def _reason(has_depth: bool, number: int, moves: bool, stands: bool) -> str:
+def _reason(has_depth: bool, number: int, moves: bool, is_frozen: bool) -> str:
     if not has_depth:
         return "depth is nowhere known"
     if number < _LEAST_PIXELS:
         return "too few pixels are known"
     if moves:
         return ""
-    return STANDS if stands else "hardly anything moves"
+    return FROZEN if is_frozen else "hardly anything moves"
 
 
-def left_out(reasons: Sequence[str], used: int) -> list[str]:
-    """Returns a note on pairs that tell nothing, if they are many; "" is no reason."""
-    reasons = [why for why in reasons if why not in ("", STANDS)]
+def note_on_untested(reasons: Sequence[str], used: int) -> list[str]:
+    """Returns a note on pairs that can't be tested, if they are many; "" is no reason."""
+    reasons = [why for why in reasons if why not in ("", FROZEN)]
     count = len(reasons) + used
-    if len(reasons) < _MANY_LEFT_OUT * count:
+    if len(reasons) < _MANY_UNTESTED * count:
         return []
     return [f"{len(reasons)} of {count} pairs are not tested: {max(reasons, key=reasons.count)}"]
 
 
-def nothing(reasons: Sequence[str]) -> Diagnosis:
-    """Returns the diagnosis without pairs that tell something."""
+def no_diagnosis(reasons: Sequence[str]) -> Diagnosis:
+    """Returns the diagnosis if no pair can be tested."""
     why = max(reasons, key=reasons.count) if reasons else "there are no two successive frames"
-    if why == STANDS:
+    if why == FROZEN:
         return Diagnosis("something is wrong", why)
     return Diagnosis("can't tell", f"{why}; record frames in which the camera moves and turns")

@@ -28,28 +28,29 @@ class Rival(NamedTuple):
     """A mistake, and the change that undoes it.
 
     Attributes:
-        of: what it is a mistake of.
-        typed: the option that corrects it, or what to do; with the fitted numbers in braces.
-        says: the mistake in words, likewise.
+        subject: what it is a mistake of.
+        remedy: the option that corrects it, or what to do; with the fitted numbers in braces.
+        description: the mistake in words, likewise.
         change: corrects pairs, given numbers `[P, k]`.
-        start: where the fit of the numbers starts; the best end counts.
+        start: where the fit of the numbers starts; of several, the one that leads to the smallest
+            residuals counts.
         usual: numbers of a typical mistake, to see whether it would show.
-        each: the numbers differ from pair to pair.
-        in_pixels: the numbers are shares of the width, rounded to whole pixels after the fit.
-            Interpolated depth would have less noise, and the rival would win for that.
+        per_pair: whether the numbers differ from pair to pair.
+        in_pixels: whether the numbers, shares of the width, are rounded to whole pixels after the
+            fit. Interpolated depth has less noise, for which alone the rival would win.
     """
 
-    of: Literal["poses", "flow", "camera", "depth"]
-    typed: str
-    says: str
+    subject: Literal["poses", "flow", "camera", "depth"]
+    remedy: str
+    description: str
     change: Change
     start: tuple[tuple[float, ...], ...] = ((),)
     usual: tuple[float, ...] = ()
-    each: bool = False
+    per_pair: bool = False
     in_pixels: bool = False
 
     def texts(self, numbers: Tensor, width: int) -> tuple[str, str]:
-        """Returns what corrects the mistake, and what it is, with the numbers that were learnt."""
+        """Returns the remedy and the description, with the numbers that were fitted."""
         n, values = [*numbers.tolist(), 0.0, 0.0], {}
         values["inverse"] = f"{1 / n[0] if n[0] else math.inf:.3g}"
         values["far"] = f"{1 / max(n[0] + n[1], 1e-6):.3g}"
@@ -59,7 +60,7 @@ class Rival(NamedTuple):
             values["degrees"] = f"{math.degrees(math.hypot(*n[:3])):.1f}"
             rows = small_motion(numbers)[:3].flatten().tolist()
             values["matrix"] = f"[{','.join(f'{x:.4g}' for x in rows)}]"
-        return self.typed.format(*n, **values), self.says.format(*n, **values)
+        return self.remedy.format(*n, **values), self.description.format(*n, **values)
 
 
 def rivals_of(
@@ -69,100 +70,105 @@ def rivals_of(
 
     Args:
         given: these options, see `Recording.conventions`.
-        by_flow: whether raw flow is the witness.
-        of_flow: whether it is the data's, and may be wrong itself.
+        by_flow: whether raw flow is the reference.
+        of_flow: whether it belongs to the data, and may be wrong itself.
         absolute: whether poses in the world are known, not the motions alone.
     """
     given = {"pose_direction": "camera_to_world", "pose_axes": "opencv", "depth_kind": "z",
              "flow_direction": "forward", "flow_channels": "uv"} | {**given}  # fmt: skip
-    table, of = [], Rival
+    table: list[Rival] = []
     directions = get_args(geometry.PoseDirection) if absolute else [given["pose_direction"]]
     for direction, axes in product(directions, get_args(geometry.CameraAxes)):
-        says = {}
+        texts = {}
         if direction != given["pose_direction"]:
-            says[f"pose_direction={direction}"] = f"the poses are {direction.replace('_', '-')}"
+            texts[f"pose_direction={direction}"] = f"the poses are {direction.replace('_', '-')}"
         if axes != given["pose_axes"]:
-            says[f"pose_axes={axes}"] = f"the camera's axes are {axes}"
-        if says:
+            texts[f"pose_axes={axes}"] = f"the camera's axes are {axes}"
+        if texts:
             change = _path(partial(_readapted, given, direction, axes))
-            table.append(of("poses", " ".join(says), " and ".join(says.values()), change))
+            table.append(Rival("poses", " ".join(texts), " and ".join(texts.values()), change))
     table += [
-        # Mirrored in y, a camera's axes are Unity's.
-        of("poses", "mirrored in x", "the world is mirrored in x", _path(partial(_mirrored, 0))),
-        of("poses", "mirrored in z", "the world is mirrored in z", _path(partial(_mirrored, 2))),
-        of("poses", "motions inverted", "motions are curr_from_prev (time runs backwards)",
-           _path(lambda path: path.flip(1))),
-        of("poses", "pose_lag_frames=1", "poses are a frame late",
-           _path(lambda path: path[:, [1, 2, 3, 3]])),
-        of("poses", "pose_lag_frames=-1", "poses are a frame early",
-           _path(lambda path: path[:, [0, 0, 1, 2]])),
-        of("poses", "poses {0:.2f} frames later", "the times of poses are {0:.2f} frames late",
-           _later, ((0.0,),), (0.5,)),
-        of("poses", "marker_from_cam={matrix}",
-           "poses are a marker's or by angles in another order, {degrees} degrees off",
-           lambda p, n: p._replace(path=p.path @ small_motion(n)[:, None]),
-           ((0.0,) * 6,), (0.1,) * 6),
-        of("camera", "K's numbers in another order", "K's numbers are fx, cx, fy, cy",
-           _camera(lambda fx, cx, fy, cy, w, h, n: (fx, fy, cx, cy))),
-        of("camera", "K in pixels", "K is in widths and heights",
-           _camera(lambda fx, cx, fy, cy, w, h, n: (w * fx, w * cx, h * fy, h * cy))),
-        of("camera", "K times {0:.3g}", "K is of pictures {inverse} times as large",
-           _camera(lambda *k: [k[-1][0] * x for x in k[:4]]), ((1.0,), (0.5,), (2.0,)), (1.25,)),
-        of("camera", "cx and cy moved by {px}", "the pictures were cropped, K was not",
-           _camera(lambda fx, cx, fy, cy, w, h, n: (fx, cx + w * n[0], fy, cy + w * n[1])),
-           ((0.0, 0.0),), (0.1, 0.1)),
-        of("camera", "fx times {0:.3g}, fy times {1:.3g}, cx and cy moved by {px}",
-           "K is another camera's", _camera(lambda fx, cx, fy, cy, w, h, n: (
-               fx * n[0].clamp(0.01), cx + w * n[2], fy * n[1].clamp(0.01), cy + w * n[3])),
-           ((1.0, 1.0, 0.0, 0.0),)),
-        of("camera", "a K for each frame", "K changes from frame to frame",
-           _zoomed, ((1.0, 1.0),), (1.01, 1.0), each=True),
-        of("camera", "distortion=[{0:.2g},0,0,0]", "the lens bends the picture (calibrate it)",
-           lambda p, n: p._replace(distortion=n), ((0.0,),), (-0.2,)),
-        of("depth", "depth times {inverse}", "depth is {0:.3g} times as long as poses say",
-           _depth(lambda z, n: z / n.clamp(1e-6)), ((1.0,), (1e-3,), (1e3,)), (2.0,)),
-        of("depth", "{0:.3g} / depth", "depth is {0:.3g} / z, a disparity",
-           _depth(lambda d, n: n.clamp(1e-6) / d), ((1.0,), (100.0,))),
-        of("depth", "depth_kind=z_buffer near_m={inverse} far_m={far}",
-           "depth is a buffer's", _depth(_from_buffer), ((5.0, -5.0),)),
+        # A world that is mirrored in y is Unity's, which is among the axes above.
+        Rival("poses", "mirrored in x", "the world is mirrored in x", _path(partial(_mirrored, 0))),
+        Rival("poses", "mirrored in z", "the world is mirrored in z", _path(partial(_mirrored, 2))),
+        Rival("poses", "motions inverted", "motions are curr_from_prev (time runs backwards)",
+              _path(lambda path: path.flip(1))),
+        Rival("poses", "pose_lag_frames=1", "poses are a frame late",
+              _path(lambda path: path[:, [1, 2, 3, 3]])),
+        Rival("poses", "pose_lag_frames=-1", "poses are a frame early",
+              _path(lambda path: path[:, [0, 0, 1, 2]])),
+        Rival("poses", "poses {0:.2f} frames later", "the times of poses are {0:.2f} frames late",
+              _later, ((0.0,),), (0.5,)),
+        Rival("poses", "marker_from_cam={matrix}",
+              "poses are a marker's or by angles in another order, {degrees} degrees off",
+              lambda p, n: p._replace(path=p.path @ small_motion(n)[:, None]),
+              ((0.0,) * 6,), (0.1,) * 6),
+        Rival("camera", "K's numbers in another order", "K's numbers are fx, cx, fy, cy",
+              _camera(lambda fx, cx, fy, cy, w, h, n: (fx, fy, cx, cy))),
+        Rival("camera", "K in pixels", "K is in widths and heights",
+              _camera(lambda fx, cx, fy, cy, w, h, n: (w * fx, w * cx, h * fy, h * cy))),
+        Rival("camera", "K times {0:.3g}", "K is of pictures {inverse} times as large",
+              _camera(lambda *k: [k[-1][0] * x for x in k[:4]]), ((1.0,), (0.5,), (2.0,)), (1.25,)),
+        Rival("camera", "cx and cy moved by {px}", "the pictures were cropped, K was not",
+              _camera(lambda fx, cx, fy, cy, w, h, n: (fx, cx + w * n[0], fy, cy + w * n[1])),
+              ((0.0, 0.0),), (0.1, 0.1)),
+        Rival("camera", "fx times {0:.3g}, fy times {1:.3g}, cx and cy moved by {px}",
+              "K is another camera's", _camera(lambda fx, cx, fy, cy, w, h, n: (
+                  fx * n[0].clamp(0.01), cx + w * n[2], fy * n[1].clamp(0.01), cy + w * n[3])),
+              ((1.0, 1.0, 0.0, 0.0),)),
+        Rival("camera", "a K for each frame", "K changes from frame to frame",
+              _zoomed, ((1.0, 1.0),), (1.01, 1.0), per_pair=True),
+        Rival("camera", "distortion=[{0:.2g},0,0,0]", "the lens bends the picture (calibrate it)",
+              lambda p, n: p._replace(distortion=n), ((0.0,),), (-0.2,)),
+        Rival("depth", "depth times {inverse}", "depth is {0:.3g} times as long as poses say",
+              _depth(lambda z, n: z / n.clamp(1e-6)), ((1.0,), (1e-3,), (1e3,)), (2.0,)),
+        Rival("depth", "{0:.3g} / depth", "depth is {0:.3g} / z, a disparity",
+              _depth(lambda d, n: n.clamp(1e-6) / d), ((1.0,), (100.0,))),
+        Rival("depth", "depth_kind=z_buffer near_m={inverse} far_m={far}",
+              "depth is a buffer's", _depth(_from_buffer), ((5.0, -5.0),)),
     ]  # fmt: skip
     is_z = given["depth_kind"] != "ray_length"
     kind, what = ("ray_length", "the ray's length") if is_z else ("z", "z, not the ray's length")
     change = partial(_along_ray, -1 if is_z else 1)
-    table.append(of("depth", f"depth_kind={kind}", f"depth is {what}", change))
+    table.append(Rival("depth", f"depth_kind={kind}", f"depth is {what}", change))
     if absolute:
         first, last = (_path(partial(_rolled, places)) for places in (-1, 1))
         table += [
-            of("poses", "pose_layout=xyz_wxyz", "quaternions have w first", first),
-            of("poses", "pose_layout=xyz_xyzw", "quaternions have w last", last),
-            of("poses", "rotations transposed", "rotations are by columns", _path(_transposed)),
+            Rival("poses", "pose_layout=xyz_wxyz", "quaternions have w first", first),
+            Rival("poses", "pose_layout=xyz_xyzw", "quaternions have w last", last),
+            Rival("poses", "rotations transposed", "rotations are by columns", _path(_transposed)),
         ]
     table += [
-        of("depth", "depth upside down", "depth has its lowest row first", partial(_turned, 1)),
-        of("depth", "depth mirrored", "depth has its last column first", partial(_turned, 0)),
+        Rival("depth", "depth upside down", "depth has its lowest row first", partial(_turned, 1)),
+        Rival("depth", "depth mirrored", "depth has its last column first", partial(_turned, 0)),
     ]
     if by_flow:
         table += [
-            of("depth", "depth moved by {px}", "depth isn't registered to the pictures",
-               _moved_depth, ((0.0, 0.0), (0.06, 0.0), (-0.06, 0.0)), (0.05, 0.0), in_pixels=True),
-            of("depth", "depth of the next frame", "depth is a frame late", _late_depth),
+            Rival("depth", "depth moved by {px}", "depth isn't registered to the pictures",
+                  _moved_depth, ((0.0, 0.0), (0.06, 0.0), (-0.06, 0.0)), (0.05, 0.0),
+                  in_pixels=True),
+            Rival("depth", "depth of the next frame", "depth is a frame late", _late_depth),
         ]  # fmt: skip
     if of_flow:
         other = {"backward": "forward", "forward": "backward"}[given["flow_direction"]]
         order = {"uv": "row_column", "row_column": "uv"}[given["flow_channels"]]
         direction, channels = f"flow_direction={other}", f"flow_channels={order}"
         table += [
-            of("flow", direction, f"flow points {other}", _gain(-1, 0, 0, -1)),
-            of("flow", channels, f"flow's channels are {order}", _gain(0, 1, 1, 0)),
-            of("flow", f"{direction} {channels}", f"flow is {other}, {order}", _gain(0, -1, -1, 0)),
-            of("flow", "u negated", "flow's u points left", _gain(-1, 0, 0, 1)),
-            of("flow", "v negated", "flow's v points up", _gain(1, 0, 0, -1)),
-            of("flow", "flow times the size", "flow is divided by the size", partial(_in_sizes, 1)),
-            of("flow", "flow times half the size", "flow is in half sizes", partial(_in_sizes, 2)),
-            of("flow", "flow divided by {0:.3g}", "flow is of pictures {0:.3g} times as large",
-               lambda p, n: p._replace(gain=p.gain * n.unsqueeze(-1)), ((1.0,),), (1.5,)),
-            of("flow", "flow_to=next backwards=true", "flow leads to the next frame", _to_next),
-            of("flow", "flow on this frame's grid", "flow is on the previous one's", _of_previous),
+            Rival("flow", direction, f"flow points {other}", _gain(-1, 0, 0, -1)),
+            Rival("flow", channels, f"flow's channels are {order}", _gain(0, 1, 1, 0)),
+            Rival("flow", f"{direction} {channels}", f"flow is {other}, {order}",
+                  _gain(0, -1, -1, 0)),
+            Rival("flow", "u negated", "flow's u points left", _gain(-1, 0, 0, 1)),
+            Rival("flow", "v negated", "flow's v points up", _gain(1, 0, 0, -1)),
+            Rival("flow", "flow times the size", "flow is divided by the size",
+                  partial(_in_sizes, 1)),
+            Rival("flow", "flow times half the size", "flow is in half sizes",
+                  partial(_in_sizes, 2)),
+            Rival("flow", "flow divided by {0:.3g}", "flow is of pictures {0:.3g} times as large",
+                  lambda p, n: p._replace(gain=p.gain * n.unsqueeze(-1)), ((1.0,),), (1.5,)),
+            Rival("flow", "flow_to=next backwards=true", "flow leads to the next frame", _to_next),
+            Rival("flow", "flow on this frame's grid", "flow is on the previous one's",
+                  _of_previous),
         ]  # fmt: skip
     return table
 
@@ -172,11 +178,11 @@ def _path(change: Callable[[Tensor], Tensor]) -> Change:
 
 
 def _readapted(given: Mapping[str, str], direction: Any, axes: Any, path: Tensor) -> Tensor:
-    """Undoes the options in force and applies others to `world_from_cam`."""
+    """Returns `world_from_cam` with the options in force undone and others applied."""
     in_force: Any = given["pose_axes"]
     ones = torch.where(torch.arange(4) == 3, 1.0, EYE)
     taken = geometry.adapt_pose(ones, axes=in_force, check=False)
-    world = taken[:, 3].diag()  # left-handed worlds have an axis turned over
+    world = taken[:, 3].diag()  # a left-handed world has an axis negated
     stored = world @ path @ torch.cat([(world @ taken)[:, :3], EYE[:, 3:]], -1).mT
     if direction != given["pose_direction"]:
         stored = geometry.invert_rigid(stored)
@@ -184,7 +190,7 @@ def _readapted(given: Mapping[str, str], direction: Any, axes: Any, path: Tensor
 
 
 def _mirrored(axis: int, path: Tensor) -> Tensor:
-    """F @ pose @ F, with F's `axis` negative."""
+    """Returns F @ pose @ F, with F's `axis` negative."""
     sign = torch.where(torch.arange(4) == axis, -1.0, 1.0).double()
     return path * sign * sign.unsqueeze(-1)
 
@@ -195,7 +201,7 @@ def _transposed(path: Tensor) -> Tensor:
 
 
 def _rolled(places: int, path: Tensor) -> Tensor:
-    """Poses whose quaternion's numbers are shifted by one."""
+    """Returns poses with the numbers of their quaternions shifted by some places."""
     known = path.isfinite().flatten(-2).all(-1)[..., None, None]
     R = torch.where(known, path, EYE)[..., :3, :3]
     # A rotation's quaternion, but for its sign, is the last eigenvector of this.
@@ -209,7 +215,7 @@ def _rolled(places: int, path: Tensor) -> Tensor:
 
 
 def _later(pairs: Pairs, share: Tensor) -> Pairs:
-    """Poses at times between those recorded, some share of a frame later."""
+    """Interpolates poses at times that are a share of a frame later than recorded."""
     poses = [torch.full_like(pairs.path[:, 0], math.nan)] * 4
     for i in (1, 2):
         start, end = (
@@ -237,7 +243,7 @@ def _camera(change: Callable[..., Sequence[Tensor]]) -> Change:
 
 
 def _zoomed(pairs: Pairs, factors: Tensor) -> Pairs:
-    """Focal lengths times a number of the current frame and one of the previous."""
+    """Multiplies focal lengths, by one factor for the current frame and one for the previous."""
     change = _camera(lambda fx, cx, fy, cy, w, h, n: (fx * n[0], cx, fy * n[0], cy))
     now, before = (change(pairs, by) for by in factors.split(1, -1))
     return pairs._replace(K=now.K, prev_K=before.prev_K)
@@ -245,7 +251,7 @@ def _zoomed(pairs: Pairs, factors: Tensor) -> Pairs:
 
 def _depth(change: Callable[[Tensor, Tensor], Tensor]) -> Change:
     def changed(pairs: Pairs, n: Tensor) -> Pairs:
-        before = pairs.before  # large, and not used beside flow
+        before = pairs.before  # not used beside flow, and costly to change
         if not pairs.by_flow:
             before = change(before.reciprocal(), n.unsqueeze(-1)).reciprocal()
         return pairs._replace(depth=change(pairs.depth, n), before=before)
@@ -254,7 +260,7 @@ def _depth(change: Callable[[Tensor, Tensor], Tensor]) -> Change:
 
 
 def _from_buffer(buffer: Tensor, line: Tensor) -> Tensor:
-    """Inverse depth falls along a line over the buffer's values, which are none beyond 1."""
+    """Returns depth of a buffer, in whose values, up to 1, inverse depth is linear."""
     near, slope = (line.movedim(1, 0)[i].unsqueeze(1) for i in (0, 1))
     inverse = near + slope.clamp(max=0.0) * buffer
     depth = torch.where(inverse > 1e-4, inverse.reciprocal(), math.inf)
@@ -262,7 +268,7 @@ def _from_buffer(buffer: Tensor, line: Tensor) -> Tensor:
 
 
 def _along_ray(power: int, pairs: Pairs, n: Tensor) -> Pairs:
-    """Depth times the length of the ray per metre of z, or divided by it."""
+    """Multiplies depth by the ray's length per metre of z (power 1), or divides by it (-1)."""
 
     def per_z(K: Tensor, pixel: Tensor) -> Tensor:
         return (torch.linalg.inv_ex(K)[0] @ homogeneous(pixel)).norm(dim=1) ** power
@@ -281,8 +287,8 @@ def _moved_depth(pairs: Pairs, shares: Tensor) -> Pairs:
 
 
 def _turned(axis: int, pairs: Pairs, n: Tensor) -> Pairs:
-    """Depth the other way round along x (0) or y (1) of the picture."""
-    if not pairs.by_flow:  # of both frames, which is as if the focal length was negative
+    """Mirrors depth along x (0) or y (1) of the picture."""
+    if not pairs.by_flow:  # depth of both frames: as if the focal length was negative
         turn = torch.eye(3, dtype=torch.float64)
         turn[axis, axis], turn[axis, 2] = -1.0, pairs.now.shape[2 - axis]
         return pairs._replace(K=turn @ pairs.K, prev_K=turn @ pairs.prev_K)
@@ -306,7 +312,7 @@ def _to_next(pairs: Pairs, n: Tensor) -> Pairs:
 
 
 def _reversed(pairs: Pairs, pixel: Tensor, maps: Tensor) -> Pairs:
-    """Flow from the frame before to this one, at places there, as if time ran back."""
+    """Returns pairs with the frames exchanged, at positions in the previous one."""
     other: Any = {"path": pairs.path.flip(1), "K": pairs.prev_K, "prev_K": pairs.K}
     other["gain"] = -pairs.gain
     depth = looked_up(maps, pixel, "nearest").reciprocal()

@@ -1,6 +1,6 @@
 """Mistakes as users make them: each takes right shots and returns those of a wrong convention.
 
-None of this is flowrep's: what undoes a mistake is in flowrep/diagnosis.py, what makes it is here.
+None of this is flowrep's: what undoes a mistake is in flowrep/diagnosis, what makes it is here.
 """
 
 from __future__ import annotations
