@@ -260,7 +260,7 @@ def _depth(change: Callable[[Tensor, Tensor], Tensor]) -> Change:
 
 
 def _from_buffer(buffer: Tensor, line: Tensor) -> Tensor:
-    """Returns depth of a buffer, in whose values, up to 1, inverse depth is linear."""
+    """Returns depth from the values of a buffer, 0 to 1, in which inverse depth is linear."""
     near, slope = (line.movedim(1, 0)[i].unsqueeze(1) for i in (0, 1))
     inverse = near + slope.clamp(max=0.0) * buffer
     depth = torch.where(inverse > 1e-4, inverse.reciprocal(), math.inf)
