@@ -53,7 +53,7 @@ from flowrep.report.runs import (
     scores_of,
     success_rate,
 )
-from flowrep.report.statistics import LEVEL, Array, Effect, Estimate, mean_share
+from flowrep.report.statistics import LEVEL, Array, Effect, Estimate, effect, mean_share
 from flowrep.report.storage import read_archive
 from flowrep.report.tables import p_text, percent, points, signed
 
@@ -62,6 +62,10 @@ DATA, PAGE = HERE.parent / "outputs" / "reference", HERE / "results.md"
 FIGURE, HELD_OUT_FIGURE = "images/results_claims.svg", "images/results_held_out.svg"
 CLAIMS = HERE / "claims.yaml"
 EARLIER = "earlier_verdicts.csv"  # on rows 1 to 8, of runs that are no longer stored
+DISTILLED = "distillation.csv"  # students of examples/distillation.py
+_DISTILLED_CONTRASTS = (
+    ("ego+obj", "raw"), ("ego+obj", "seg2"), ("ego+obj+seg2", "seg2"), ("ego+obj+seg2", "ego+obj"),
+)  # fmt: skip
 _COLOURS = dict(zip(SCENES, ("#0072b2", "#e69f00", "#009e73", "#cc79a7")))
 _STUDY = {"resolution": ", 84 px", "wide_confirmation": ", 0.6–2.4 m/s"}  # in the figure
 _TIED = "\u00a0"  # a space at which no line breaks
@@ -205,6 +209,61 @@ def draw_held_out(cells: Sequence[Cell]) -> Figure:
             SuccessGrid(cell.title, grid.series, tuple(shown), cells_shown, baselines_shown)
         )
     return draw_bars(grids)
+
+
+def students(data: Path = DATA) -> dict[tuple[str, str, str], Array]:
+    """Returns success `[R, 3]` of students, by what they learn from, speeds and stack."""
+    found: dict[tuple[str, str, str], list[list[float]]] = {}
+    with (data / DISTILLED).open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            name = "labels", row["trained_at_mps"].replace("-", "–"), row["representations"]
+            found.setdefault(name, []).append([float(row[speed]) for speed in SPEEDS])
+    return {name: np.array(rates) for name, rates in found.items()}
+
+
+def rewarded(runs: Sequence[Run], stacks: Iterable[str]) -> dict[tuple[str, str, str], Array]:
+    """Returns the same of runs that learned from rewards."""
+    found: dict[tuple[str, str, str], list[list[float]]] = {}
+    for run in runs:
+        if run.stack in stacks:
+            at = [run.under(Condition("greedy", speed, run.fps)) for speed in SPEEDS]
+            name = "rewards", _speed_range(run, run.speed), run.stack
+            found.setdefault(name, []).append([success_rate([of["outcome"]]) for of in at])
+    return {name: np.array(rates) for name, rates in found.items()}
+
+
+def learned_table(rates: Mapping[tuple[str, str, str], Array]) -> str:
+    """Returns success in %, at each speed and in the mean over the three."""
+    rows = []
+    for (source, trained_at, stack), of in rates.items():
+        mean = percent(mean_share([of.mean(1)]))
+        each = (f"{100 * rate:.0f}" for rate in of.mean(0))
+        rows.append((source, trained_at, _stack(stack), str(len(of)), *each, mean))
+    header = ("learned from", "trained at, m/s", "", "runs", *SPEEDS, "mean of the three [95 %]")
+    return _table(header, rows)
+
+
+def learned_contrasts(rates: Mapping[tuple[str, str, str], Array]) -> str:
+    """Returns the declared differences between stacks, in points."""
+    rows = []
+    for of in dict.fromkeys(name[:2] for name in rates):
+        for stacks in _DISTILLED_CONTRASTS:
+            sides = [rates[*of, stack] for stack in stacks if (*of, stack) in rates]
+            if len(sides) < 2:
+                continue
+            found = effect([tuple(side.mean(1) for side in sides)])
+            each = (signed(x) for x in sides[0].mean(0) - sides[1].mean(0))
+            tested = points(found.interval()), p_text(found.p_value)
+            rows.append((*of, " − ".join(map(_stack, stacks)), *tested, *each))
+    header = ("learned from", "trained at, m/s", "", "mean of the three [95 %]")
+    return _table((*header, "p (uncorrected)", *SPEEDS), rows)
+
+
+def spread(groups: Iterable[Array]) -> float:
+    """Returns the standard deviation of runs `[R, 3]` of a group, in points, over all groups."""
+    means = [rates.mean(1) for rates in groups]
+    squares = sum(((of - of.mean()) ** 2).sum() for of in means)
+    return 100 * float(squares / sum(len(of) - 1 for of in means)) ** 0.5
 
 
 def protocols_table(narrow: Sequence[Claim], wide: Sequence[Claim], scene: str) -> str:
@@ -519,6 +578,9 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
     with (DATA / EARLIER).open(encoding="utf-8", newline="") as file:
         earlier = {int(row["row"]): row for row in csv.DictReader(file)}
     cells = held_out_cells(declared, studies)
+    by_labels = students()
+    with_labels = {stack for _, _, stack in by_labels}
+    by_rewards = rewarded(studies["laptop"].get("straight_road", []), with_labels)
     figures = {FIGURE: draw_claims([*primary, *secondary])}
     if cells:
         figures[HELD_OUT_FIGURE] = draw_held_out(cells)
@@ -547,6 +609,9 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
             # row 14 against the paper's other stack of two frames, row 19 at each speed alone
             against_depth=beside("frame_rate", "depth2", {12: 1, 6: -1}),
             alone={speed: beside("wide_confirmation", "raw", {speed: 1}) for speed in SPEEDS},
+            learned=learned_table(by_labels | by_rewards),
+            learned_contrasts=learned_contrasts(by_labels | by_rewards),
+            spreads=[spread(of.values()) for of in (by_labels, by_rewards)],
             wide=protocols_table(primary, in_its_scenes("wide_speeds"), "straight_road"),
             figure=FIGURE,
             scenes={words(scene): scene_table(of, scene in forks) for scene, of in main.items()},

@@ -454,3 +454,22 @@ def test_the_commands_of_a_study_make_its_stored_runs(stored, study):
     lines = DECLARED["commands"][study].replace("\\\n", "").splitlines()
     trained = [set(runs_of(line)) for line in lines if "flowrep.train" in line]
     assert set().union(*trained) == {identity(r) for of in stored[study].values() for r in of}
+
+
+def test_students_are_compared_by_the_mean_of_three_speeds(tmp_path):
+    (tmp_path / results.DISTILLED).write_text(
+        "trained_at_mps,representations,seed,frames,episodes,low,normal,high\n"
+        "0.6-2.4,raw,1,9,9,0.5,0.6,0.7\n"
+        "0.6-2.4,ego+obj,1,9,9,0.8,0.85,0.9\n"
+        "0.6-2.4,raw,2,9,9,0.4,0.5,0.6\n"
+        "0.6-2.4,ego+obj,2,9,9,0.9,0.95,1.0\n"
+    )
+    rates = results.students(tmp_path)
+    table = results.learned_table(rates).splitlines()
+    # The means 0.6 and 0.5 have an error of 0.05; one degree of freedom, t = 12.7, gives no bound.
+    assert table[2] == "|labels|0.6–2.4|`[raw]`|2|45|55|65|55 [0–100]|"
+    # The errors 0.05 and 0.05 have two degrees of freedom, t = 4.30, and 0.35 is 4.95 errors:
+    # p = 1 - t / sqrt(t² + 2).
+    difference = results.learned_contrasts(rates).splitlines()[2:]
+    assert difference == ["|labels|0.6–2.4|`[ego,obj]` − `[raw]`|+35 [+5, +65]|0.038|+40|+35|+30|"]
+    assert results.spread(rates.values()) == pytest.approx(100 * 0.005**0.5)
