@@ -243,18 +243,25 @@ def learned_table(rates: Mapping[tuple[str, str, str], Array]) -> str:
     return _table(header, rows)
 
 
+def learned_effects(
+    rates: Mapping[tuple[str, str, str], Array],
+) -> dict[tuple[str, str, str, str], Effect]:
+    """Returns the declared differences between stacks in the mean over the three speeds."""
+    return {
+        (*of, first, second): effect([(rates[*of, first].mean(1), rates[*of, second].mean(1))])
+        for of in dict.fromkeys(name[:2] for name in rates)
+        for first, second in _DISTILLED_CONTRASTS
+        if (*of, first) in rates and (*of, second) in rates
+    }
+
+
 def learned_contrasts(rates: Mapping[tuple[str, str, str], Array]) -> str:
-    """Returns the declared differences between stacks, in points."""
+    """Returns these differences, and those at each speed, in points."""
     rows = []
-    for of in dict.fromkeys(name[:2] for name in rates):
-        for stacks in _DISTILLED_CONTRASTS:
-            sides = [rates[*of, stack] for stack in stacks if (*of, stack) in rates]
-            if len(sides) < 2:
-                continue
-            found = effect([tuple(side.mean(1) for side in sides)])
-            each = (signed(x) for x in sides[0].mean(0) - sides[1].mean(0))
-            tested = points(found.interval()), p_text(found.p_value)
-            rows.append((*of, " − ".join(map(_stack, stacks)), *tested, *each))
+    for (*of, first, second), found in learned_effects(rates).items():
+        each = rates[*of, first].mean(0) - rates[*of, second].mean(0)
+        tested = points(found.interval()), p_text(found.p_value)
+        rows.append((*of, f"{_stack(first)} − {_stack(second)}", *tested, *map(signed, each)))
     header = ("learned from", "trained at, m/s", "", "mean of the three [95 %]")
     return _table((*header, "p (uncorrected)", *SPEEDS), rows)
 
