@@ -588,6 +588,7 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
     by_labels = students()
     with_labels = {stack for _, _, stack in by_labels}
     by_rewards = rewarded(studies["laptop"].get("straight_road", []), with_labels)
+    led = learned_effects(by_labels | by_rewards)
     figures = {FIGURE: draw_claims([*primary, *secondary])}
     if cells:
         figures[HELD_OUT_FIGURE] = draw_held_out(cells)
@@ -618,6 +619,14 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
             alone={speed: beside("wide_confirmation", "raw", {speed: 1}) for speed in SPEEDS},
             learned=learned_table(by_labels | by_rewards),
             learned_contrasts=learned_contrasts(by_labels | by_rewards),
+            lead=[
+                points(led[source, speed, "ego+obj", "raw"].interval())
+                for source, speed in (
+                    ("labels", "1.2–1.8"),
+                    ("rewards", "1.2–1.8"),
+                    ("labels", "0.6–2.4"),
+                )
+            ],
             spreads=[spread(of.values()) for of in (by_labels, by_rewards)],
             wide=protocols_table(primary, in_its_scenes("wide_speeds"), "straight_road"),
             figure=FIGURE,
