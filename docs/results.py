@@ -620,11 +620,13 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
             learned=learned_table(by_labels | by_rewards),
             learned_contrasts=learned_contrasts(by_labels | by_rewards),
             lead=[
-                points(led[source, speed, "ego+obj", "raw"].interval())
-                for source, speed in (
-                    ("labels", "1.2–1.8"),
-                    ("rewards", "1.2–1.8"),
-                    ("labels", "0.6–2.4"),
+                points(led[names].interval())
+                for names in (
+                    ("labels", "1.2–1.8", "ego+obj", "raw"),
+                    ("rewards", "1.2–1.8", "ego+obj", "raw"),
+                    ("labels", "0.6–2.4", "ego+obj", "raw"),
+                    ("labels", "0.6–2.4", "ego+obj+seg2", "seg2"),
+                    ("labels", "0.6–2.4", "ego+obj+seg2", "ego+obj"),
                 )
             ],
             spreads=[spread(of.values()) for of in (by_labels, by_rewards)],
