@@ -66,6 +66,9 @@ DISTILLED = "distillation.csv"  # students of examples/distillation.py
 _DISTILLED_CONTRASTS = (
     ("ego+obj", "raw"), ("ego+obj", "seg2"), ("ego+obj+seg2", "seg2"), ("ego+obj+seg2", "ego+obj"),
 )  # fmt: skip
+# Success [R, 3] at low, normal and high speed, by what runs learn from, people's speeds in training
+# and stack.
+Learned = Mapping[tuple[str, str, str], Array]
 _COLOURS = dict(zip(SCENES, ("#0072b2", "#e69f00", "#009e73", "#cc79a7")))
 _STUDY = {"resolution": ", 84 px", "wide_confirmation": ", 0.6–2.4 m/s"}  # in the figure
 _TIED = "\u00a0"  # a space at which no line breaks
@@ -211,8 +214,8 @@ def draw_held_out(cells: Sequence[Cell]) -> Figure:
     return draw_bars(grids)
 
 
-def students(data: Path = DATA) -> dict[tuple[str, str, str], Array]:
-    """Returns success `[R, 3]` of students, by what they learn from, speeds and stack."""
+def students(data: Path = DATA) -> Learned:
+    """Returns the success of students, which learn from labels."""
     found: dict[tuple[str, str, str], list[list[float]]] = {}
     with (data / DISTILLED).open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
@@ -221,18 +224,18 @@ def students(data: Path = DATA) -> dict[tuple[str, str, str], Array]:
     return {name: np.array(rates) for name, rates in found.items()}
 
 
-def rewarded(runs: Sequence[Run], stacks: Iterable[str]) -> dict[tuple[str, str, str], Array]:
-    """Returns the same of runs that learned from rewards."""
-    found: dict[tuple[str, str, str], list[list[float]]] = {}
-    for run in runs:
-        if run.stack in stacks:
-            at = [run.under(Condition("greedy", speed, run.fps)) for speed in SPEEDS]
-            name = "rewards", _speed_range(run, run.speed), run.stack
-            found.setdefault(name, []).append([success_rate([of["outcome"]]) for of in at])
-    return {name: np.array(rates) for name, rates in found.items()}
+def rewarded(runs: Sequence[Run], stacks: Iterable[str]) -> Learned:
+    """Returns the success of runs that learned from rewards, of these stacks."""
+    found = {}
+    for stack in stacks:
+        if of := [run for run in runs if run.stack == stack]:
+            cells = [cell_of(of, condition) for condition in conditions_of(of[0], SPEEDS)]
+            name = "rewards", _speed_range(of[0], of[0].speed), stack
+            found[name] = np.stack([cell.rates for cell in cells if cell], -1)
+    return found
 
 
-def learned_table(rates: Mapping[tuple[str, str, str], Array]) -> str:
+def learned_table(rates: Learned) -> str:
     """Returns success in %, at each speed and in the mean over the three."""
     rows = []
     for (source, trained_at, stack), of in rates.items():
@@ -243,10 +246,8 @@ def learned_table(rates: Mapping[tuple[str, str, str], Array]) -> str:
     return _table(header, rows)
 
 
-def learned_effects(
-    rates: Mapping[tuple[str, str, str], Array],
-) -> dict[tuple[str, str, str, str], Effect]:
-    """Returns the declared differences between stacks in the mean over the three speeds."""
+def learned_effects(rates: Learned) -> dict[tuple[str, str, str, str], Effect]:
+    """Returns the differences between two stacks in the mean over the three speeds."""
     return {
         (*of, first, second): effect([(rates[*of, first].mean(1), rates[*of, second].mean(1))])
         for of in dict.fromkeys(name[:2] for name in rates)
@@ -255,7 +256,7 @@ def learned_effects(
     }
 
 
-def learned_contrasts(rates: Mapping[tuple[str, str, str], Array]) -> str:
+def learned_contrasts(rates: Learned) -> str:
     """Returns these differences, and those at each speed, in points."""
     rows = []
     for (*of, first, second), found in learned_effects(rates).items():
@@ -586,9 +587,10 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
         earlier = {int(row["row"]): row for row in csv.DictReader(file)}
     cells = held_out_cells(declared, studies)
     by_labels = students()
-    with_labels = {stack for _, _, stack in by_labels}
-    by_rewards = rewarded(studies["laptop"].get("straight_road", []), with_labels)
-    led = learned_effects(by_labels | by_rewards)
+    stacks_with_labels = dict.fromkeys(stack for _, _, stack in by_labels)
+    by_rewards = rewarded(studies["laptop"].get("straight_road", []), stacks_with_labels)
+    learned = {**by_labels, **by_rewards}
+    led = learned_effects(learned)
     figures = {FIGURE: draw_claims([*primary, *secondary])}
     if cells:
         figures[HELD_OUT_FIGURE] = draw_held_out(cells)
@@ -617,8 +619,8 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
             # row 14 against the paper's other stack of two frames, row 19 at each speed alone
             against_depth=beside("frame_rate", "depth2", {12: 1, 6: -1}),
             alone={speed: beside("wide_confirmation", "raw", {speed: 1}) for speed in SPEEDS},
-            learned=learned_table(by_labels | by_rewards),
-            learned_contrasts=learned_contrasts(by_labels | by_rewards),
+            learned=learned_table(learned),
+            learned_contrasts=learned_contrasts(learned),
             lead=[
                 points(led[names].interval())
                 for names in (

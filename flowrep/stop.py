@@ -1,4 +1,4 @@
-"""A long loop's stop by Ctrl-C or a signal."""
+"""Stops a long loop on Ctrl-C or a signal, between two of its steps."""
 
 import os
 import select

@@ -92,6 +92,13 @@ def test_a_run_and_a_policy_of_ones_own_drive_as_baselines_do(tmp_path):
     assert [e.outcome for e in ended[f"{path}:make"]] == [e.outcome for e in never]
 
 
+def test_a_view_has_the_speed_and_the_frame_rate_that_were_asked_for():
+    (episode,) = driven(asked("fps=6", "speed=high", "scene.time_limit_steps=12", "episodes=1"))
+    assert (episode.fps, episode.speed) == (6.0, "high")
+    (episode,) = driven(asked("scene.frame_rate_hz=8", "scene.time_limit_steps=12", "episodes=1"))
+    assert (episode.fps, episode.speed) == (8.0, "normal")
+
+
 def test_a_folder_belongs_to_a_scene_and_a_policy():
     scenes = [load_scene(name) for name in ("straight_road", "s_turn")]
     policies = "planner", "outputs/a run/", "outputs/another", "../mine.py:make"
