@@ -56,8 +56,8 @@ demo: $(INSTALLED)  ## A trained agent drives 20 episodes, the first as a film: 
 view: $(INSTALLED)  ## Look at a scene: make view ARGS="scene=s_turn"
 	$(BIN)/python -m flowrep.view $(ARGS)
 
-results: $(INSTALLED)  ## Make the page of results from the stored runs
-	$(BIN)/python -m docs.results
+results: $(INSTALLED)  ## Make paper/results.md and its figures from the stored runs
+	$(BIN)/python -m paper.results
 
 SCENES = straight_road s_turn h_shaped_pathways three_way_junction
 

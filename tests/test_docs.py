@@ -252,9 +252,7 @@ def commands_in(page):
                 yield words
 
 
-# Those of the results are compared with stored runs, in tests/test_results.py.
 WITH_COMMANDS = [*PAGES, DOCS.parent / "README.md"]
-WITH_COMMANDS.remove(DOCS / "results.md")
 
 
 @pytest.mark.slow

@@ -47,7 +47,7 @@ def test_the_gallery_shows_every_scene_and_make_gallery_makes_it():
 def test_the_readmes_agents_are_those_of_the_results_and_of_the_trained_agents_card():
     rows = README.read_text(encoding="utf-8").split("| pedestrians |")[1].splitlines()[2:5]
     taught, demo = zip(*(line.split("|")[2:4] for line in rows))
-    results = (README.parent / "docs" / "results.md").read_text(encoding="utf-8")
+    results = (README.parent / "paper" / "results.md").read_text(encoding="utf-8")
     (row,) = re.findall(r"^\|recipe 3.*\|SR\|`\[ego,obj\]`\|.*", results, re.MULTILINE)
     assert [cell.strip() for cell in taught] == row.split("|")[5:8]
     card = (README.parent / "flowrep" / "pretrained" / "README.md").read_text(encoding="utf-8")
@@ -57,7 +57,7 @@ def test_the_readmes_agents_are_those_of_the_results_and_of_the_trained_agents_c
 
 def test_the_readmes_count_of_verdicts_is_that_of_the_results():
     text = README.read_text(encoding="utf-8")
-    results = (README.parent / "docs" / "results.md").read_text(encoding="utf-8")
+    results = (README.parent / "paper" / "results.md").read_text(encoding="utf-8")
     verdicts = re.findall(r"^\|[1-8]\|.*?\*\*(\w+)[^|]*\*\*\|", results, re.MULTILINE)
     counted = [verdicts.count(word) for word in ("holds", "contradicted", "not")]
     assert counted == [2, 1, 5]

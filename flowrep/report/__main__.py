@@ -19,11 +19,10 @@ from flowrep.usage import UsageError
 def report(config: ReportConfig) -> Path:
     """Writes figures, tables and a page of runs; returns the page's path."""
     from flowrep.experiment.outcomes import print_table
-    from flowrep.report.storage import is_archive, read_runs, without_repeats
+    from flowrep.report.runs import read_runs, without_repeats
 
     folders = list(map(Path, config.run))
-    holds_runs = folders[0].is_dir() and not is_archive(folders[0])
-    output = Path(config.output or (folders[0] if holds_runs else Path("outputs")) / "report")
+    output = Path(config.output or folders[0] / "report")
     readable, unreadable = read_runs(folders)
     runs, repeats = without_repeats(readable)
     warnings = [*unreadable, *repeats]

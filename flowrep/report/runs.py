@@ -1,7 +1,8 @@
-"""Runs for a report: which of them may be compared, and the success of their episodes."""
+"""Runs for a report, read from folders: which may be compared, and the success of episodes."""
 
+import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property, reduce
 from itertools import product
 from pathlib import Path
@@ -11,9 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrep.choices import SpeedMode
-from flowrep.experiment.run import flattened, origin_of
+from flowrep.experiment.lock import RunFolderError
+from flowrep.experiment.outcomes import EVALUATION_COLUMNS, OUTCOMES, EpisodeRecord
+from flowrep.experiment.run import RunFolder, flattened, origin_of
 from flowrep.report.statistics import Array, Estimate, mean_share
+from flowrep.tables import TableError
 
+Cells = Mapping[str, Sequence[str]]
+"""A table's text by column."""
 Columns = dict[str, NDArray[Any]]
 """A table by column."""
 Score = Callable[[Sequence[NDArray[Any]]], float]
@@ -30,6 +36,15 @@ STACKS = tuple(dict.fromkeys(FLOW_STACKS + COMPLEMENTARY_STACKS))
 DRAWN_BASELINES = ("never_turn", "random", "planner", "speed_blind")
 _REPRESENTATIONS = ("raw", "ego", "obj", "seg", "seg2", "depth", "depth2", "rgb")
 _OF_EVERY_SCENE = ("camera", "frame_rate_hz")  # keys whose values are the same in all scenes
+_MACHINE = ("commit", "precision", "cpu")
+_TYPES: dict[Any, type] = {"int": int, "float": float, "str": str}
+# Columns of evaluation.csv that don't follow from the run's config and the outcome.
+EPISODE_COLUMNS = {
+    each.name: _TYPES[each.type]
+    for each in fields(EpisodeRecord)
+    if each.name in EVALUATION_COLUMNS
+    and each.name not in ("representations", "flow", "seed", "return")
+}
 
 
 class Condition(NamedTuple):
@@ -44,7 +59,7 @@ class Condition(NamedTuple):
 class Run:
     """A run's config and tables."""
 
-    name: str  # its folder, or its name in packed tables
+    name: str  # its folder
     config: Mapping[str, Any]
     episodes: Columns  # of evaluation.csv
     metrics: Columns  # of metrics.csv, nan where a cell is empty
@@ -93,6 +108,87 @@ class Run:
         asked = zip(Condition._fields, condition)
         chosen = np.logical_and.reduce([self.tested, *(e[name] == v for name, v in asked)])
         return {name: column[chosen] for name, column in e.items()}
+
+
+def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
+    """Returns the runs in folders at any depth, and a warning for each that was left out."""
+    runs: dict[str, Run] = {}  # by path, so that a folder given twice counts once
+    warnings: list[str] = []
+    for folder in folders:
+        paths = [config.parent for config in sorted(folder.rglob("config.yaml"))]
+        paths = [p for p in paths if {".hydra", "wandb"}.isdisjoint(p.relative_to(folder).parts)]
+        if not paths:
+            what = "holds no run" if folder.exists() else "does not exist"
+            raise RunFolderError(f"'{folder}' {what}. Give the folder of a run or of a sweep")
+        for path in paths:
+            try:
+                runs.setdefault(str(path.resolve()), read_run(path))
+            except (RunFolderError, TableError, OSError, UnicodeDecodeError) as error:
+                warnings.append(" ".join(str(error).split()))
+    return list(runs.values()), warnings
+
+
+def read_run(path: Path) -> Run:
+    """Returns the run in a folder; raises RunFolderError or TableError for a damaged one."""
+    folder = RunFolder.existing(path)
+    try:
+        config = folder.read_config()
+        tables = folder.read_episodes(), folder.read_metrics()
+        episodes, metrics = (
+            {k: [row[k] for row in t] for k in (t[0] if t else ())} for t in tables
+        )
+        columns = episode_columns(episodes), metric_columns(metrics)
+        return Run(str(path), config, *columns, path, _machine(path / "machine.json"))
+    except (RunFolderError, TableError):
+        raise
+    # Overflow: a seed of .inf, or of more digits than an integer of numpy holds.
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError, OverflowError) as e:
+        what = f"config.yaml or a table is not what a run leaves ({e!r})"
+        raise RunFolderError(f"{path}: {what}; restore the file that the run wrote") from None
+
+
+def episode_columns(cells: Cells) -> Columns:
+    """Returns the columns of evaluation.csv that a report reads, "" for missing ones."""
+    empty = [""] * len(cells.get("frames", ()))
+    columns: Columns = {
+        name: np.array(cells.get(name, empty), kind) for name, kind in EPISODE_COLUMNS.items()
+    }
+    # A misspelt "success" would count as a failure.
+    unknown = {*columns["outcome"].tolist()} - {*OUTCOMES}
+    if unknown:
+        names = ", ".join(map(repr, sorted(unknown)))
+        raise ValueError(f"unknown outcome {names} of an episode; known: {', '.join(OUTCOMES)}")
+    return columns
+
+
+def metric_columns(cells: Cells) -> Columns:
+    """Returns the columns of metrics.csv, nan for empty cells."""
+    return {name: np.array([float(x or "nan") for x in column]) for name, column in cells.items()}
+
+
+def _machine(path: Path) -> dict[str, str]:
+    # A run that was resumed on another machine has several machines.
+    try:
+        machines = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
+        values = {key: dict.fromkeys(str(each.get(key)) for each in machines) for key in _MACHINE}
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{path.name}: {error}") from error
+    return {key: " | ".join(names) or "unknown" for key, names in values.items()}
+
+
+def without_repeats(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
+    """Returns one run per config and seed, the one with the most tested episodes.
+
+    The second value has a warning for each run that is left out.
+    """
+    kept: dict[Any, Run] = {}
+    warnings = []
+    for run in sorted(runs, key=lambda run: (-int(run.tested.sum()), -run.frames)):
+        best = kept.setdefault((run.stack, run.seed, *sorted(run.settings.items())), run)
+        if run is not best:
+            same = f"{run.name} is the same run as {best.name}, config and seed"
+            warnings.append(f"{same}: left out, as it would count as another seed")
+    return [run for run in runs if run in kept.values()], warnings
 
 
 def _settings(config: Mapping[str, Any]) -> dict[str, str]:

@@ -19,8 +19,7 @@ from flowrep.experiment.run import DRIVES
 from flowrep.report.__main__ import main, report
 from flowrep.report.figures import draw_bars, encoded
 from flowrep.report.page import plans_and_films_of, tracks_of
-from flowrep.report.runs import Condition, grid_of
-from flowrep.report.storage import read_run, read_runs
+from flowrep.report.runs import Condition, grid_of, read_run, read_runs
 from tests.report.folders import config_of, letters, rows_of, run_in, write_run
 
 

@@ -1,15 +1,88 @@
-"""What a run is, and which runs may be compared: no two configs are ever taken for one."""
+"""What a run is, how folders are read, and which runs may be compared: no two configs for one."""
 
+import math
 from typing import get_args
 
 import pytest
+import yaml
 
 pytest.importorskip("scipy", reason="reports are an extra")
 
 from flowrep.choices import BaselineName
-from flowrep.report.runs import DRAWN_BASELINES, groups_of
-from flowrep.report.storage import read_run, read_runs
-from tests.report.folders import config_of, rows_of, run_in, write_run
+from flowrep.experiment.lock import RunFolderError
+from flowrep.report.runs import DRAWN_BASELINES, groups_of, read_run, read_runs, without_repeats
+from tests.report.folders import config_of, letters, rows_of, run_in, write_run
+
+
+def names(runs):
+    return [run.folder.name for run in runs]
+
+
+@pytest.mark.parametrize("name", ["wandb", ".hydra"])
+def test_runs_are_found_wherever_they_lie_and_once(tmp_path, name):
+    # the name means nothing above a run; inside of one it is of what is no run
+    run_in(tmp_path / name / "sweep", "a")
+    inside = run_in(tmp_path / name, "b", seed=1) / name
+    inside.mkdir()
+    (inside / "config.yaml").write_text("seed: 1\n")
+    runs, warnings = read_runs([tmp_path / name, tmp_path / name / "b"])
+    assert (names(runs), warnings) == (["b", "a"], [])
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "expected"),
+    [
+        ("config.yaml", "seed: [", "config.yaml"),
+        ("config.yaml", "seed: 1\n", "scene"),
+        ("config.yaml", yaml.safe_dump(config_of(total_frames=None)), "config.yaml"),
+        ("evaluation.csv", "scene;fps\n1;2\n", "evaluation.csv"),
+        ("metrics.csv", "frames,success\nmany,0.5\n", "'many'"),
+        ("machine.json", "[{", "machine.json"),
+        ("machine.json", "[1]", "machine.json"),
+        ("config.yaml", yaml.safe_dump(config_of(seed=math.inf)), "config.yaml"),
+        ("config.yaml", yaml.safe_dump(config_of(total_frames=math.inf)), "config.yaml"),
+        ("metrics.csv", f"frames,success\n{'9' * 401},0.5\n", "table"),
+        ("evaluation.csv", None, "table"),
+    ],
+)
+def test_a_damaged_folder_is_one_line_and_the_others_are_read(tmp_path, file, text, expected):
+    run_in(tmp_path, "good")
+    bad = run_in(tmp_path, "bad", seed=1) / file
+    bad.write_text(text or bad.read_text().replace("100", "9" * 26))  # the seed of an episode
+    runs, (warning,) = read_runs([tmp_path])
+    assert names(runs) == ["good"]
+    assert "/bad" in warning
+    assert expected in warning
+    assert "\n" not in warning
+
+
+@pytest.mark.parametrize("name", ["none", "empty"])
+def test_a_folder_without_runs_is_named(tmp_path, name):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(RunFolderError, match=name):
+        read_runs([tmp_path / name])
+
+
+def test_a_run_that_is_there_twice_counts_as_one_seed(tmp_path):
+    run_in(tmp_path, "first")
+    config = config_of(device="cuda")  # of the machine
+    rows = rows_of(config, letters(5)) + rows_of(config, letters(5), speed="low")
+    write_run(tmp_path / "second", config, rows)
+    runs, (warning,) = without_repeats(read_runs([tmp_path])[0])
+    assert names(runs) == ["second"]  # which has more episodes
+    assert all(name in warning for name in ("first", "second"))
+
+
+def test_an_outcome_that_is_not_known_is_named_and_its_run_left_out(tmp_path):
+    run_in(tmp_path, "good")
+    config = config_of(seed=1)
+    rows = rows_of(config, "sss")
+    rows[1]["outcome"] = "sucess"  # as a failure it would make this 2 of 3
+    write_run(tmp_path / "bad", config, rows)
+    runs, (warning,) = read_runs([tmp_path])
+    assert names(runs) == ["good"]
+    assert "/bad" in warning
+    assert "'sucess'" in warning
 
 
 def labels(folder):

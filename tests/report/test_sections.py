@@ -9,10 +9,9 @@ import pytest
 
 pytest.importorskip("scipy", reason="reports are an extra")
 
-from flowrep.report.runs import Condition, cell_of, changes, curve_of, paired_scores
+from flowrep.report.runs import Condition, cell_of, changes, curve_of, paired_scores, read_runs
 from flowrep.report.sections import assemble
 from flowrep.report.statistics import Estimate
-from flowrep.report.storage import read_runs
 from flowrep.report.tables import Table, listed, p_text, percent, points, ratio
 from tests.report.folders import config_of, rows_of, run_in, write_run
 

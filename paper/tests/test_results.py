@@ -12,8 +12,13 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 pytest.importorskip("scipy", reason="reports are an extra")
 pytest.importorskip("jinja2", reason="reports are an extra")
 
-from docs import results
-from docs.claims import (
+
+from flowrep.report.runs import Run, episode_columns, groups_of, without_repeats
+from flowrep.report.sections import assemble
+from flowrep.report.statistics import UNSEEN, Effect
+from paper import results
+from paper.archive import read_archives
+from paper.claims import (
     Claim,
     Contrast,
     beside_held_out,
@@ -23,17 +28,7 @@ from docs.claims import (
     scores,
     studies_of,
 )
-from docs.results import rate_table
-from flowrep.report.runs import Run, groups_of
-from flowrep.report.sections import assemble
-from flowrep.report.statistics import UNSEEN, Effect
-from flowrep.report.storage import (
-    episode_columns,
-    is_archive,
-    read_archive,
-    read_runs,
-    without_repeats,
-)
+from paper.results import rate_table
 from tests.config.composing import plain
 from tests.report.folders import config_of, letters, rows_of
 
@@ -183,9 +178,9 @@ def test_a_claim_of_several_contrasts_may_hold_in_part():
 
 @pytest.fixture(scope="module")
 def packed():
-    if not is_archive(results.DATA):
+    if not results.DATA.is_dir():
         pytest.skip("source distributions have no runs")
-    return read_archive(results.DATA)
+    return read_archives(results.DATA)
 
 
 def held_out_runs(successes, collapsed=()):
@@ -411,9 +406,7 @@ def test_every_stored_episode_has_one_of_its_scenes_paths(stored):
 
 @pytest.mark.slow
 def test_a_report_on_the_names_of_a_study_has_the_numbers_of_the_page(stored):
-    names = DECLARED["studies"]["main"]["s_turn"].split()
-    runs, _ = read_runs([results.DATA / name for name in names])
-    assert {run.name for run in runs} == {run.name for run in stored["main"]["s_turn"]}
+    runs = stored["main"]["s_turn"]
     tables = [table for section in assemble(runs, []).sections for table in section.tables]
     (line,) = re.findall(r"^\|`\[seg2\]`\|.*", results.scene_table(runs, False), re.M)
     (told,) = [table for table in tables if table.name == "complementary_success"]

@@ -1,4 +1,4 @@
-"""The page of results: `make results` writes docs/results.md and its figures.
+"""The page of results: `make results` writes paper/results.md and its figures.
 
 claims.py tests what claims.yaml declares, results.md.jinja has the words around the numbers, and
 all numbers come from the packed runs.
@@ -18,23 +18,6 @@ from jinja2 import FileSystemLoader
 from matplotlib.figure import Figure
 from scipy import stats
 
-from docs.claims import (
-    SHORT,
-    Cell,
-    Claim,
-    Contrast,
-    HeldOut,
-    Studies,
-    beside_held_out,
-    claims_of,
-    conditions_of,
-    contrast_of,
-    held_out_cells,
-    held_out_claims,
-    measure_of,
-    scores,
-    studies_of,
-)
 from flowrep.report.figures import draw_bars, encoded, styled, words
 from flowrep.report.page import TEMPLATES
 from flowrep.report.runs import (
@@ -54,8 +37,25 @@ from flowrep.report.runs import (
     success_rate,
 )
 from flowrep.report.statistics import LEVEL, Array, Effect, Estimate, effect, mean_share
-from flowrep.report.storage import read_archive
 from flowrep.report.tables import p_text, percent, points, signed
+from paper.archive import read_archives
+from paper.claims import (
+    SHORT,
+    Cell,
+    Claim,
+    Contrast,
+    HeldOut,
+    Studies,
+    beside_held_out,
+    claims_of,
+    conditions_of,
+    contrast_of,
+    held_out_cells,
+    held_out_claims,
+    measure_of,
+    scores,
+    studies_of,
+)
 
 HERE = Path(__file__).parent
 DATA, PAGE = HERE.parent / "outputs" / "reference", HERE / "results.md"
@@ -661,7 +661,7 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
 def main(data: Path = DATA, page: Path = PAGE) -> None:
     """Entry point."""
     declared = yaml.safe_load(CLAIMS.read_text(encoding="utf-8"))
-    text, figures = render(declared, read_archive(data))
+    text, figures = render(declared, read_archives(data))
     page.write_text(text, encoding="utf-8")
     for name, figure in figures.items():
         (page.parent / name).write_bytes(encoded(figure, "svg"))
