@@ -89,8 +89,8 @@ test-lowest: $(DEVELOPED)  ## Run the fast tests with the oldest packages that p
 	@touch .venv-lowest/.installed .venv-lowest/.developed
 	$(MAKE) test-fast ENV=.venv-lowest
 
-schema: $(INSTALLED)  ## Write the JSON schema of scene files that editors use
-	$(BIN)/python -c 'from flowrep.scenes.load import json_schema; print(json_schema(), end="")' > docs/scene.schema.json
+schema: $(INSTALLED)  ## Write what editors and docs/scenes.md say about the keys of scene files
+	$(BIN)/python -m docs.scene_keys
 
 lint: $(DEVELOPED)  ## Check style, formatting and spelling
 	$(BIN)/ruff check .

@@ -166,7 +166,7 @@ def checked(config: DictConfig, schema: type[Command]) -> Any:
     choice = str(job.runtime.choices.get("scene") or "").rpartition("/")[2]
     name = (plain.get("scene") or {}).get("name")
     is_typed = any(text.startswith("scene.name=") for text in typed)
-    if name in group_choices("scene") and choice not in ("", name) and not is_typed:
+    if name and choice not in ("", name) and not is_typed:
         raise UsageError(
             f"scene={choice} has the name '{name}', under which its results would be filed: write "
             f"name: {choice} in its file, or add scene.name={choice}"

@@ -26,6 +26,7 @@ from flowrep.scenes.scene import (
     Path,
     Road,
     Scene,
+    SceneError,
     Walk,
 )
 from flowrep.scenes.vehicle import VehicleState, footprint_corners
@@ -157,7 +158,10 @@ class Layout:
             Box(o.kind, *o.center_m, math.radians(o.yaw_deg), o.size_m, i)
             for i, o in enumerate(scene.obstacles)
         ]
-        self.obstacles = (*single, *chain(*map(self._obstacle_row, scene.obstacle_rows)))
+        rows = [list(self._obstacle_row(row)) for row in scene.obstacle_rows]
+        for i, row in enumerate(scene.obstacle_rows):
+            _check_any(f"obstacle_rows[{i}]", row, rows[i])
+        self.obstacles = (*single, *chain(*rows))
         shapely.prepare(self.drivable)
 
     def pose_at(self, road: str, at_m: float, offset_m: float = 0.0) -> tuple[float, float, float]:
@@ -228,11 +232,13 @@ class Layout:
         # doesn't change the others.
         rng = np.random.default_rng(self.scene.layout_seed)
         boxes: list[Box] = []
-        for row in self.scene.building_rows:
+        for i, row in enumerate(self.scene.building_rows):
+            count = len(boxes)
             if row.side in ("start", "end"):
                 boxes.append(self._house_across(row, rng))
             else:
                 self._add_houses(row, rng, boxes)
+            _check_any(f"building_rows[{i}]", row, boxes[count:])
         return tuple(boxes)
 
     def _house_across(self, row: BuildingRow, rng: np.random.Generator) -> Box:
@@ -278,6 +284,14 @@ class Layout:
             box = Box(row.kind, x, y, heading + facing, row.size_m, i)
             if not shapely.intersects(box.footprint, taken).any():
                 yield box
+
+
+def _check_any(key: str, row: BuildingRow | ObstacleRow, boxes: list[Box]) -> None:
+    if not boxes:
+        raise SceneError(
+            f"{key}: none of it is placed, because roads or houses are in the way from "
+            f"{row.from_m:g} to {row.to_m:g} m; move the row, or give smaller sizes"
+        )
 
 
 def free_ground(layout: Layout, path: Path) -> shapely.Geometry:

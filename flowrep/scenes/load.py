@@ -1,7 +1,6 @@
-"""Loads and checks a scene, given by name, YAML file or mapping; writes the schema for editors."""
+"""Loads and checks a scene, given by name, YAML file or mapping."""
 
 import dataclasses
-import json
 import pickle
 from collections.abc import Mapping
 from functools import cache, lru_cache
@@ -44,7 +43,10 @@ def load_scene(scene: str | Path | Mapping[str, Any] | Scene) -> Scene:
         data = read_yaml(path)
     except UsageError as error:
         raise SceneError(str(error)) from error
-    return _loaded(data, str(path))
+    loaded = _loaded(data, str(path))
+    if loaded.name != path.stem:  # results are filed under the name
+        raise SceneError(f"{path}: name: is {loaded.name!r}; give the file's name, {path.stem!r}")
+    return loaded
 
 
 def scene_names() -> list[str]:
@@ -60,13 +62,6 @@ def scene_data(scene: Scene) -> dict[str, Any]:
     """
     data: dict[str, Any] = _adapter().dump_python(scene, mode="json", exclude_defaults=True)
     return data
-
-
-def json_schema() -> str:
-    """Returns the JSON schema of scene files, as text."""
-    schema = _adapter().json_schema()
-    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
-    return json.dumps(schema, indent=1) + "\n"
 
 
 @cache

@@ -73,24 +73,29 @@ def _check_height(kind: Kind, size_m: tuple[float, float, float]) -> None:
         raise ValueError(f"a {kind} is at least {least_m} m high")
 
 
-# Strict: a number in quotes, or true for 1, is a mistake.
-Number = Annotated[float, Strict()]
+# Strict: a number in quotes, or true for 1, is a mistake. Beyond 10 km, coordinates in float32 are
+# further apart than a millimetre; whatever is counted along a road is bounded by this, too.
+MOST_M = 10_000.0
+Position = Annotated[float, Strict(), Field(ge=-MOST_M, le=MOST_M)]
+Length = Annotated[float, Strict(), Field(gt=0.0, le=MOST_M)]
+LengthOrZero = Annotated[float, Strict(), Field(ge=0.0, le=MOST_M)]
 Positive = Annotated[float, Strict(), Field(gt=0.0)]
 NotNegative = Annotated[float, Strict(), Field(ge=0.0)]
 Angle = Annotated[float, Strict(), Field(ge=-360.0, le=360.0)]
-HouseSide = Annotated[float, Strict(), Field(ge=1.0)]  # rows are filled house by house
-Count = Annotated[int, Strict(), Field(ge=1)]
+HouseSide = Annotated[float, Strict(), Field(ge=1.0, le=MOST_M)]  # rows are filled house by house
+Count = Annotated[int, Strict(), Field(ge=1, le=1_000_000_000)]
 Pixels = Annotated[int, Strict(), Field(ge=1, le=4096)]  # 4K; more would exhaust memory
 Whole = Annotated[int, Strict(), Field(ge=0)]
 Name = Annotated[str, StringConstraints(min_length=1)]
 FileName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
-Point = tuple[Number, Number]
-Size3 = tuple[Positive, Positive, Positive]
+Point = tuple[Position, Position]
+Size3 = tuple[Length, Length, Length]
 SpeedRange = Annotated[tuple[NotNegative, NotNegative], AfterValidator(_in_order)]
 HouseRange = Annotated[tuple[HouseSide, HouseSide], AfterValidator(_in_order)]
 
 
-# The docstrings of the classes are the descriptions in the JSON schema that editors show.
+# `docs/scene_keys.py` makes the descriptions that editors and docs/scenes.md show of the docstrings
+# of classes and fields.
 
 
 class Part:
@@ -101,16 +106,24 @@ class Part:
 
 @dataclass(frozen=True)
 class CameraConfig(Part):
-    """A camera on the vehicle: `fov_deg` is vertical, `pitch_deg` is positive upwards."""
+    """A camera on the vehicle."""
 
     height_px: Pixels
+    """Height of all maps."""
     width_px: Pixels
+    """Width of all maps."""
     fov_deg: Annotated[float, Strict(), Field(ge=1.0, le=179.0)]
-    mount_height_m: Positive
-    mount_forward_m: Number
+    """Vertical field of view."""
+    mount_height_m: Length
+    """Height above the ground."""
+    mount_forward_m: Position
+    """Distance ahead of the vehicle's centre, negative behind it."""
     pitch_deg: Annotated[float, Strict(), Field(ge=-90.0, le=90.0)]
-    near_m: Positive
-    far_m: Positive
+    """Angle above the horizon, negative to look down."""
+    near_m: Length
+    """Nearest depth that is drawn."""
+    far_m: Length
+    """Farthest depth that is drawn; everything beyond is sky."""
 
     def __post_init__(self) -> None:
         if self.near_m >= self.far_m:
@@ -124,23 +137,32 @@ class CameraConfig(Part):
 
 @dataclass(frozen=True)
 class VehicleConfig(Part):
-    """Footprint, speed and turning of the vehicle."""
+    """Size, speed and turning of the vehicle."""
 
-    length_m: Positive
-    width_m: Positive
-    height_m: Positive
+    length_m: Length
+    """Length of the footprint, which must stay on the road."""
+    width_m: Length
+    """Width of the footprint."""
+    height_m: Length
+    """Height of the box that collides."""
     speed_mps: Positive
+    """Constant speed in m/s."""
     yaw_acceleration_dps2: Positive
+    """α: an action to turn changes the yaw rate by α times the duration of a step, in °/s²."""
     max_yaw_rate_dps: Positive
+    """Largest yaw rate to either side, in °/s."""
 
 
 @dataclass(frozen=True)
 class Piece(Part):
-    """One stretch of centreline: straight, or an arc (positive degrees turn left)."""
+    """One stretch of the centreline after the other, straight or an arc."""
 
-    straight_m: Positive | None = None
-    arc_radius_m: Positive | None = None
+    straight_m: Length | None = None
+    """Length of a straight piece, which has no other key."""
+    arc_radius_m: Length | None = None
+    """Radius of an arc."""
     arc_deg: Angle | None = None
+    """Angle of an arc, positive to the left."""
 
     def __post_init__(self) -> None:
         arc = (self.arc_radius_m, self.arc_deg)
@@ -151,28 +173,35 @@ class Piece(Part):
 
 @dataclass(frozen=True)
 class Road(Part):
-    """A drivable ribbon along a centreline, with a sidewalk on either side."""
+    """A drivable ribbon along a centreline, with sidewalks; roads that overlap merge."""
 
     name: Name
+    """The name by which other keys refer to the road."""
     start_m: Point
+    """Where the centreline begins, [x, y]."""
     heading_deg: Angle
-    width_m: Positive
-    sidewalk_m: NotNegative
+    """The centreline's direction there."""
+    width_m: Length
+    """Width of the drivable ground."""
+    sidewalk_m: LengthOrZero
+    """Width of each sidewalk; 0 for none."""
     pieces: Annotated[tuple[Piece, ...], Field(min_length=1)]
 
 
 @dataclass(frozen=True)
 class Zone(Part):
-    """The whole width of a road between two distances from its start.
-
-    A vehicle starts in the middle of its zone, facing along the road, or against it if `reverse`.
-    """
+    """The whole width of a road between two distances along it, where episodes start or end."""
 
     name: Name
+    """The name by which paths refer to the zone."""
     road: Name
-    from_m: Number
-    to_m: Number
+    """A road's name."""
+    from_m: Position
+    """Where the zone begins; an episode starts in its middle."""
+    to_m: Position
+    """Where the zone ends; one in which episodes end is at least 1 m long."""
     reverse: Annotated[bool, Strict()] = False
+    """Whether a vehicle that starts here faces against the road's direction."""
 
     def __post_init__(self) -> None:
         _check_forward(self.from_m, self.to_m)
@@ -180,23 +209,32 @@ class Zone(Part):
 
 @dataclass(frozen=True)
 class Path(Part):
-    """The task of an episode: from a start zone to an end zone, with some exits closed."""
+    """The task of an episode, which draws one of all."""
 
     name: Name
+    """The path's name, in tables and in the env's `info`."""
     start: Name
+    """The zone in which it starts."""
     end: Name
+    """The zone that has to be reached."""
     closures: tuple[Name, ...] = ()
+    """The closures that are present in its episodes."""
 
 
 @dataclass(frozen=True)
 class Closure(Part):
-    """A building across a road, present in episodes whose path names it."""
+    """A building across a road and its sidewalks, present in episodes whose path names it."""
 
     name: Name
+    """The name by which paths refer to it."""
     road: Name
-    at_m: Number
-    depth_m: Positive
-    height_m: Positive
+    """A road's name."""
+    at_m: Position
+    """Where its middle is."""
+    depth_m: Length
+    """Its length along the road."""
+    height_m: Length
+    """Its height."""
 
 
 _KEYS_OF_WALK = {
@@ -208,15 +246,22 @@ _KEYS_OF_WALK = {
 
 @dataclass(frozen=True)
 class Walk(Part):
-    """The walk of a group, back and forth: across a road, along it, or through given points."""
+    """The line on which a group walks back and forth."""
 
     kind: Literal["across", "along", "points"]
+    """Across a road (at `at_m`), along it (`from_m`, `to_m`, `offset_m`), or through `points_m`."""
     road: Name | None = None
-    at_m: Number | None = None
-    from_m: Number | None = None
-    to_m: Number | None = None
-    offset_m: Number = 0.0
+    """A road's name."""
+    at_m: Position | None = None
+    """Where people cross the road and its sidewalks."""
+    from_m: Position | None = None
+    """One end of a walk along the road."""
+    to_m: Position | None = None
+    """The other end."""
+    offset_m: Position = 0.0
+    """Distance of a walk along a road to the left of its centreline."""
     points_m: tuple[Point, ...] = ()
+    """The points [x, y] that a walk connects."""
 
     def __post_init__(self) -> None:
         keys = _KEYS_OF_WALK[self.kind]
@@ -229,18 +274,21 @@ class Walk(Part):
 
 @dataclass(frozen=True)
 class PedestrianGroup(Part):
-    """People on one walk; `standing` of them never move.
-
-    `draw` says whether speed, phase and direction are drawn once for the group or for each person.
-    """
+    """People who walk back and forth from a random phase, each in a separate lane."""
 
     name: Name
+    """The group's name, for error messages."""
     count: Count
-    spread_m: NotNegative
+    """The number of people."""
+    spread_m: LengthOrZero
+    """Width of all lanes together, and the group's length along the walk."""
     walk: Walk
     standing: Whole = 0
+    """How many of them stand still."""
     draw: Literal["group", "pedestrian"] = "group"
+    """Whether speed and phase are drawn once for the group, or for each person."""
     speed_mps: SpeedRange | None = None
+    """[lowest, highest] speed, instead of that of the speed mode."""
 
     def __post_init__(self) -> None:
         if self.standing > self.count:
@@ -249,19 +297,25 @@ class PedestrianGroup(Part):
 
 @dataclass(frozen=True)
 class BuildingRow(Part):
-    """House fronts along one side of a road, or one house across its start or end.
-
-    Houses of a row are placed only where there is no road, sidewalk or earlier house.
-    """
+    """Houses along one side of a road, wherever there is room, or one across its start or end."""
 
     road: Name
+    """A road's name."""
     side: Literal["left", "right", "start", "end"]
-    from_m: Number
-    to_m: Number
-    setback_m: NotNegative
+    """The side of the road, seen along it; `start` and `end` give one house."""
+    from_m: Position
+    """Where a row begins; 0 for `start` and `end`."""
+    to_m: Position
+    """Where a row ends; 0 for `start` and `end`."""
+    setback_m: LengthOrZero
+    """Distance of the fronts from the road's edge, at least the sidewalk's width; up to 0.8 m more
+    is drawn for each house. For `start` and `end`, the distance from the end of the road."""
     front_m: HouseRange
+    """[least, greatest] width of a house along the road."""
     depth_m: HouseRange
+    """[least, greatest] depth of a house."""
     height_m: HouseRange
+    """[least, greatest] height of a house."""
 
     def __post_init__(self) -> None:
         if self.side in ("left", "right"):
@@ -272,16 +326,17 @@ class BuildingRow(Part):
 
 @dataclass(frozen=True)
 class Obstacle(Part):
-    """A static object: kind, position, heading and size.
-
-    `size_m` is (length, width, height), with length along the heading. It covers the part that a
-    vehicle can hit: the trunk of a tree or the post of a light, not the parts that hang above.
-    """
+    """A static object beside the road, or on it."""
 
     kind: Kind
+    """What it is; a `lamp_post` has the category building, as a `house`."""
     center_m: Point
+    """Where it stands, [x, y]."""
     yaw_deg: Angle
+    """Its heading."""
     size_m: Size3
+    """[length, width, height] of what can be hit: the trunk of a tree, not its crown. Cars are at
+    least 0.7 m high, traffic lights 1 m, lamp posts 0.3 m."""
 
     def __post_init__(self) -> None:
         _check_height(self.kind, self.size_m)
@@ -289,19 +344,26 @@ class Obstacle(Part):
 
 @dataclass(frozen=True)
 class ObstacleRow(Part):
-    """Obstacles of one kind along a road, `offset_m` to the left of its centreline.
+    """Obstacles of one kind along a road, except on another road or in a house.
 
     They face like parked cars in right-hand traffic: along the road on the right, against it on the
-    left. Obstacles that would stand on another road or in a house are left out.
+    left.
     """
 
     kind: Kind
+    """As of an obstacle."""
     road: Name
-    offset_m: Number
-    from_m: Number
-    to_m: Number
-    every_m: Positive
+    """A road's name."""
+    offset_m: Position
+    """Distance to the left of the road's centreline."""
+    from_m: Position
+    """Where the first one stands."""
+    to_m: Position
+    """Where the row ends."""
+    every_m: Length
+    """Distance from one to the next."""
     size_m: Size3
+    """As of an obstacle."""
 
     def __post_init__(self) -> None:
         _check_forward(self.from_m, self.to_m)
@@ -310,42 +372,50 @@ class ObstacleRow(Part):
 
 @dataclass(frozen=True)
 class Crosswalk(Part):
-    """Stripes across the whole width of a road, extending `depth_m` along it."""
+    """Stripes across the whole width of a road."""
 
     road: Name
-    at_m: Number
-    depth_m: Positive
+    """A road's name."""
+    at_m: Position
+    """Where their middle is."""
+    depth_m: Length
+    """Their length along the road."""
 
 
 @dataclass(frozen=True)
 class Scene(Part):
-    """A complete scene as data; `load_scene` reads and checks one.
-
-    Grass covers the ground between the roads and up to `terrain_m` beyond their bounds; 0 for none.
-    `corner_radius_m` rounds the kerb where roads meet. `symmetric` says that the mirror image of a
-    drive is a possible drive in this scene, too, so that an agent may learn from mirror images.
-    """
+    """A complete scene as data; `load_scene` reads and checks one."""
 
     name: FileName
+    """The scene's name, which is also that of its file."""
     frame_rate_hz: Annotated[float, Strict(), Field(ge=FRAME_RATES_HZ[0], le=FRAME_RATES_HZ[1])]
+    """Steps per second."""
     time_limit_steps: Count
+    """The longest episode in steps; at another frame rate, the limit in seconds stays the same."""
     categories: Annotated[tuple[Name, ...], AfterValidator(_named_once)]
+    """All classes that the semantic map may show; `flowrep.scenes.CATEGORY_ID` has their ids."""
     layout_seed: Whole
+    """Seed of the houses' sizes and fronts, which are drawn once for the scene."""
     camera: CameraConfig
     vehicle: VehicleConfig
     roads: Annotated[tuple[Road, ...], Field(min_length=1), AfterValidator(_named_once)]
     zones: Annotated[tuple[Zone, ...], Field(min_length=1), AfterValidator(_named_once)]
     paths: Annotated[tuple[Path, ...], Field(min_length=1), AfterValidator(_named_once)]
     pedestrian_speed_mps: Annotated[dict[SpeedMode, SpeedRange], AfterValidator(_all_modes)]
+    """[lowest, highest] speed of people in each of the modes low, normal and high."""
     pedestrian_groups: Annotated[tuple[PedestrianGroup, ...], AfterValidator(_named_once)] = ()
     building_rows: tuple[BuildingRow, ...] = ()
     obstacles: tuple[Obstacle, ...] = ()
     obstacle_rows: tuple[ObstacleRow, ...] = ()
     closures: Annotated[tuple[Closure, ...], AfterValidator(_named_once)] = ()
     crosswalks: tuple[Crosswalk, ...] = ()
-    terrain_m: NotNegative = 0.0
-    corner_radius_m: NotNegative = 0.0
+    terrain_m: LengthOrZero = 0.0
+    """How far grass extends beyond the roads' bounding box, which it fills; 0 for none."""
+    corner_radius_m: LengthOrZero = 0.0
+    """Radius of the kerb where roads meet; a gap narrower than twice this becomes road."""
     symmetric: Annotated[bool, Strict()] = False
+    """Whether the mirror image of all roads and paths is the same street, so that agents may learn
+    from mirror images."""
 
     @property
     def time_limit_s(self) -> float:

@@ -222,11 +222,11 @@ def test_a_slip_in_a_file_of_ones_own_names_file_and_line(run, tmp_path, group, 
     assert f'"{file}", line {number}' in line
 
 
-def test_a_scene_file_that_kept_the_name_of_its_original_is_refused(run, tmp_path):
+def test_a_scene_file_in_which_another_name_stands_is_refused(run, tmp_path):
     (tmp_path / "scene").mkdir()
     original = (CONF_DIR / "scene" / "s_turn.yaml").read_text()
     mine = tmp_path / "scene" / "back_alley.yaml"
-    mine.write_text(original)
+    mine.write_text(original.replace("name: s_turn", "name: alley", 1))
     line = ["--config-dir", str(tmp_path), "scene=back_alley"]
     code, _, said = run("train", *line)
     assert code == 2

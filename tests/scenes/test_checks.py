@@ -63,6 +63,13 @@ def refusal(data, changes):
         ({"zones.0.from_m": 5.5}, "zones[0]"),
         ({"building_rows": [BUILDING_ROW | {"to_m": -9}]}, "building_rows[0]"),
         ({"building_rows": [BUILDING_ROW | {"side": "end"}]}, "building_rows[0]"),
+        ({"building_rows": [BUILDING_ROW | {"from_m": -1e10}]}, "building_rows[0].from_m"),
+        # Rows of which nothing would be placed, or too much: the sidewalk is 2 m wide, and a house
+        # at least 7 m; the arms take the ground beside the last 5 m of the stem.
+        ({"building_rows": [BUILDING_ROW | {"setback_m": 1.9}]}, "building_rows[0].setback_m"),
+        ({"building_rows": [BUILDING_ROW | {"from_m": 39.0}]}, "building_rows[0]"),
+        ({"obstacle_rows": [OBSTACLE_ROW | {"from_m": 39.0, "offset_m": 4.0}]}, "obstacle_rows[0]"),
+        ({"obstacle_rows": [OBSTACLE_ROW | {"every_m": 0.001}]}, "building_rows and obstacle_rows"),
         ({"obstacle_rows": [OBSTACLE_ROW | {"to_m": 0.0}]}, "obstacle_rows[0]"),
         ({"obstacles.0.size_m": [4.0, 1.8, 0.6]}, "obstacles[0]"),
         ({"pedestrian_groups.1.walk.at_m": MISSING}, "pedestrian_groups[1].walk"),

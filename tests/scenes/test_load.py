@@ -1,16 +1,17 @@
 """Scenes from names, files and data; files that can't be read; the schema for editors."""
 
+import json
 from pathlib import Path
 
 import pytest
 import yaml
 
+from docs import scene_keys
 from flowrep.scenes import SceneError, load_scene
-from flowrep.scenes.load import json_schema, scene_data
+from flowrep.scenes.load import scene_data
 from flowrep.yaml_file import CONF_DIR
 
 CROSSROADS = Path(__file__).parent / "crossroads.yaml"
-SCHEMA = Path(__file__).parents[2] / "docs" / "scene.schema.json"
 
 
 def test_name_file_mapping_and_scene_give_the_same_scene(data):
@@ -52,20 +53,29 @@ def test_a_scene_that_does_not_exist_is_refused(tmp_path, monkeypatch, scene, na
         load_scene(scene)
 
 
+def test_the_name_of_a_scene_is_that_of_its_file(tmp_path):
+    file = tmp_path / "alley.yaml"
+    file.write_bytes(CROSSROADS.read_bytes())
+    with pytest.raises(SceneError, match=r"alley\.yaml: name: .*'alley'"):
+        load_scene(file)
+
+
 def test_merge_keys_and_anchors_of_yaml_may_be_used(tmp_path, data):
     data["building_rows"] = "ROWS"
     rows = """
   - &house {road: stem, side: left, from_m: 0.0, to_m: 10.0, setback_m: 2.0,
             front_m: [7, 9], depth_m: [6, 9], height_m: [5, 9]}
   - {<<: *house, from_m: 20.0, to_m: 38.0}"""
-    file = tmp_path / "merged.yaml"
+    file = tmp_path / "crossroads.yaml"
     file.write_text(yaml.dump(data).replace("ROWS", rows))
     first, second = load_scene(file).building_rows
     assert (first.to_m, second.to_m, second.front_m) == (10.0, 38.0, (7.0, 9.0))
 
 
-def test_the_schema_for_editors_is_that_of_the_code():
-    assert SCHEMA.read_text(encoding="utf-8") == json_schema(), "make schema"
+def test_every_key_is_explained_in_the_page_and_in_editors():
+    text = scene_keys.PAGE.read_text("utf-8")
+    assert scene_keys.page(text) == text, "make schema"
+    assert json.loads(scene_keys.SCHEMA.read_text("utf-8")) == scene_keys.schema(), "make schema"
 
 
 @pytest.mark.parametrize("file", [*sorted((CONF_DIR / "scene").glob("*.yaml")), CROSSROADS])
