@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from flowrep.extras import require
 
-require("training", "train", "hydra", "pydantic", "matplotlib", "imageio_ffmpeg", module=__name__)
+require("training", "train", "hydra", "pydantic", "imageio_ffmpeg", module=__name__)
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
@@ -165,7 +165,7 @@ def complete(runner: Runner, stop: StopRequest) -> bool:
         if stop or not runner.evaluate("final", stop):
             return False
         print(f"wall time: {runner.clock.summary()}")
-    runner.plot_and_film()
+    runner.film()
     return True
 
 

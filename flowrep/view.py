@@ -5,7 +5,7 @@ What needs PyTorch, which takes seconds to import, is imported when the config h
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace
 from itertools import pairwise
@@ -15,16 +15,14 @@ from typing import TYPE_CHECKING, Any
 
 from flowrep.extras import require
 
-require("viewing", "train", "hydra", "pydantic", module=__name__)
+require("viewing", "train", "hydra", "pydantic", "matplotlib", "imageio_ffmpeg", module=__name__)
 
-import numpy as np
 from hydra.core.hydra_config import HydraConfig
 
 from flowrep.config.cli import folder_name, run_command
 from flowrep.config.schema import ViewConfig, check_policy, policy_kind
 from flowrep.files import replace_files
 from flowrep.progress import progress_bar
-from flowrep.scenes.scene import CATEGORY_ID
 from flowrep.tables import write_rows
 from flowrep.usage import UsageError
 from flowrep.viz import contact_sheet, write_png, write_video
@@ -36,16 +34,15 @@ if TYPE_CHECKING:
     from flowrep.scenes import Scene
 
 ENVS = 16  # side by side, for the episodes that are not filmed
-FILES = ("sheet.png", "episode.mp4", "plan.png", "episodes.csv", "categories.csv")
+FILES = ("sheet.png", "episode.mp4", "plan.png", "episodes.csv")
 """The files of a view; a new view replaces all of them."""
 
 
 def run(config: ViewConfig) -> None:
-    """Writes pictures, a film and tables of the scene, or opens a window on it."""
+    """Writes pictures, a film and tables of the scene."""
     check_policy(config.policy)
 
     from flowrep.experiment.film import Film
-    from flowrep.experiment.window import Keyboard, drive_by_hand
 
     keys = [text.partition("=")[0].lstrip("+") for text in HydraConfig.get().overrides.task]
     changed = [key for key in keys if key.startswith("scene.")]
@@ -53,11 +50,7 @@ def run(config: ViewConfig) -> None:
         raise UsageError(f"{changed[0]}= changes a scene: add scene=, which names it")
     agent = agent_of(config, "scene" in keys)
     with closing(Film(agent, **street_of(config))) as film:
-        options = episodes_of(config, film.street.scene)
-        if config.interactive:
-            drive_by_hand(Keyboard(film.policy, Path(config.policy).name), film, options[0])
-        else:
-            view(config, agent, film, options, folder_of(config, film.street.scene))
+        view(config, agent, film)
 
 
 def keeps_scene(config: ViewConfig, is_scene_given: bool) -> bool:
@@ -101,15 +94,14 @@ def episodes_of(config: ViewConfig, scene: Scene) -> list[dict[str, Any]]:
     return [{"episode_seed": seed, "speed": config.speed} | path for seed in seeds]
 
 
-def view(
-    config: ViewConfig, agent: Agent, film: Film, options: list[dict[str, Any]], folder: Path
-) -> None:
-    """Drives episodes and writes their pictures, plan, film and tables into a folder."""
+def view(config: ViewConfig, agent: Agent, film: Film) -> None:
+    """Drives episodes and writes their pictures, plan, film and table into a folder."""
     from flowrep.experiment.outcomes import print_table
     from flowrep.scenes.layout import Layout
     from flowrep.viz.plan import Track, draw_plan
 
     scene = film.street.scene
+    options, folder = episodes_of(config, scene), folder_of(config, scene)
     with progress_bar(what="driving", unit="frame") as bar:
         frames, episode = film.drive(options[0], lambda _: bar.update())
     episodes = [episode, *drive_on(config, agent, options[1:])]
@@ -117,11 +109,9 @@ def view(
     # Closed exits belong to a path; they are drawn if all episodes took the same one.
     path = episode.path if all(each.path == episode.path for each in episodes) else None
     origin = agent.origin("view") | {"policy": config.policy}
-    tables = {
-        "episodes": [replace(each, **origin).row() for each in episodes],
-        "categories": category_rows(scene.categories, (frame.maps["seg"] for frame in frames)),
-    }
+    rows = [replace(each, **origin).row() for each in episodes]
     folder.mkdir(parents=True, exist_ok=True)
+    # Drawn elsewhere first, so that a full disk leaves an earlier view whole.
     with TemporaryDirectory() as name:
         new = Path(name)
         if config.video:
@@ -131,18 +121,16 @@ def view(
         chosen = moments([moving_pixels(frame.maps) for frame in frames], config.sheet_rows)
         write_png(new / "sheet.png", contact_sheet(film.draw(frames[i]) for i in chosen))
         draw_plan(Layout(scene), tracks, path=path).savefig(new / "plan.png", dpi=110)
-        for title, rows in tables.items():
-            write_rows(new / f"{title}.csv", rows)
-        there = {path.name: path.read_bytes() for path in new.iterdir()}
-    replace_files(folder, there)
-    for name in {*FILES} - {*there}:  # of an earlier view with a film
+        write_rows(new / "episodes.csv", rows)
+        written = {path.name: path.read_bytes() for path in new.iterdir()}
+    replace_files(folder, written)
+    for name in {*FILES} - {*written}:  # of an earlier view with a film
         (folder / name).unlink(missing_ok=True)
     shown = ("path", "episode_seed", "outcome", "hit", "return", "length")
-    print_table("episodes", [{name: row[name] for name in shown} for row in tables["episodes"]])
-    print_table("categories", tables["categories"])
+    print_table("episodes", [{name: row[name] for name in shown} for row in rows])
     arrived = sum(each.outcome == "success" for each in episodes)
     print(f"{config.policy}: {arrived} of {len(episodes)} episodes end in success")
-    print(f"{folder}: {', '.join(each for each in FILES if (folder / each).exists())}")
+    print(f"{folder}: {', '.join(each for each in FILES if each in written)}")
 
 
 def drive_on(
@@ -158,21 +146,6 @@ def drive_on(
         counted = progress_bar(ended, what="driving on", unit="episode", total=len(options))
         episodes = list(counted)
     return sorted(episodes, key=lambda episode: episode.episode_seed)
-
-
-def category_rows(categories: Iterable[str], seg: Iterable[Any]) -> list[dict[str, Any]]:
-    """Returns each category's share of the pixels of class maps and of the maps, in %."""
-    counts = np.stack([np.bincount(np.ravel(ids), minlength=256) for ids in seg])
-    pixels, pictures = counts.sum(axis=0), (counts > 0).mean(axis=0)
-    return [
-        {
-            "category": name,
-            "pixels": int(pixels[CATEGORY_ID[name]]),
-            "pixels_percent": round(100 * pixels[CATEGORY_ID[name]] / pixels.sum(), 3),
-            "pictures_percent": round(100 * pictures[CATEGORY_ID[name]], 1),
-        }
-        for name in categories
-    ]
 
 
 def moving_pixels(maps: Mapping[str, Any]) -> int:

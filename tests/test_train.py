@@ -96,10 +96,9 @@ def test_a_run_leaves_a_folder_that_a_person_can_open(smoke_run):
     assert [row["frames"] for row in read_rows(run / "metrics.csv")] == ["64", "128", "192", "256"]
     assert list(run.glob("tensorboard/events.out.tfevents.*"))
     assert (run / "checkpoint" / "latest.safetensors").stat().st_size > 1e6
-    assert (run / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
     assert (run / "videos" / "episode_normal.mp4").stat().st_size > 1e4
     assert {path.name for path in run.iterdir() if not path.name.startswith(".")} == {
-        "config.yaml", "metrics.csv", "tensorboard", "learning_curve.png", "checkpoint",
+        "config.yaml", "metrics.csv", "tensorboard", "checkpoint",
         "drives.npz", "evaluation.csv", "failures.csv", "machine.json", "videos",
     }  # fmt: skip
 
@@ -123,13 +122,11 @@ def test_a_complete_run_is_not_evaluated_twice(smoke_run):
     tables = [run / "evaluation.csv", run / "failures.csv"]
     before = [table.read_text() for table in tables]
     tables[1].unlink()  # a full disk, say, left out what comes after the evaluation
-    (run / "learning_curve.png").unlink()
     film = run / "videos" / "episode_normal.mp4"
     film.write_bytes(film.read_bytes()[:5000])  # of a version that didn't notice a full disk
     assert "this run is complete" in command("train", f"resume={run}", cwd=run)
     assert is_playable(film)
     assert [table.read_text() for table in tables] == before
-    assert (run / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_evaluate_adds_rows_for_what_was_asked(smoke_run):

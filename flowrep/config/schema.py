@@ -342,7 +342,6 @@ class ViewConfig(Command):
     episodes: Count
     sheet_rows: Count
     video: bool
-    interactive: bool
 
 
 class ReportConfig(Command):

@@ -70,8 +70,7 @@ class StreetEnv(gym.Env):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(
                 f"render_mode is {render_mode!r}; give 'rgb_array' or None. A window opens with "
-                "gymnasium.wrappers.HumanRendering around an env of 'rgb_array', or with python -m "
-                "flowrep.view interactive=true"
+                "gymnasium.wrappers.HumanRendering around an env of 'rgb_array'"
             )
         self.scene = load_scene(scene)
         self.speed_mps = _speed_range(self.scene, speed)

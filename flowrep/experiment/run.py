@@ -156,7 +156,6 @@ class RunFolder:
         self.evaluation_path = self.path / "evaluation.csv"
         self.drives_path = self.path / DRIVES
         self.failures_path = self.path / "failures.csv"
-        self.curve_path = self.path / "learning_curve.png"
         self.loggers = Loggers(self.path)
         self._lock: FolderLock | None = None
 

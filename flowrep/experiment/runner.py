@@ -195,19 +195,14 @@ class Runner:
             print_results([record.row() for record in records])
         return True
 
-    def plot_and_film(self) -> None:
-        """Writes causes of failure and the learning curve; films an episode if none is filmed."""
+    def film(self) -> None:
+        """Writes the table of failures; films an episode if none is filmed."""
         # Drawing takes seconds to import.
         from flowrep.experiment.film import record_episode
-        from flowrep.experiment.learning_curve import draw_learning_curve
         from flowrep.viz import is_playable
 
         self.close()  # its worker processes take memory, and so does filming
-        metrics, episodes = self.folder.read_metrics(), self.folder.read_episodes()
         self.folder.write_failures()
-        fps = self.env.base_env.frame_rate_hz
-        path = self.folder.curve_path
-        draw_learning_curve(path, metrics, episodes, speed=self.config.speed, fps=fps)
         path = self.folder.video_path(f"episode_{self.config.speed}")
         if self.config.evaluation.video and not is_playable(path):
             driver = Driver(self.agent.policy, self.config, self.frames)

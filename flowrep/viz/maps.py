@@ -139,12 +139,11 @@ def depth_to_rgb(depth: Any, range_m: float = DEPTH_RANGE_M) -> Image:
 
 
 class Tile(NamedTuple):
-    """How a map is drawn and explained."""
+    """How a map is drawn."""
 
     label: str
     draw: Callable[[Any], Image]  # takes the map [C, H, W]
     note: Note = ""  # below the label
-    about: str = ""  # what it shows, in a sentence
     is_flow: bool = False  # whether it has the colours of `flow_to_rgb`
 
 
@@ -155,26 +154,14 @@ def stock_tiles(
 ) -> dict[str, Tile]:
     """Returns the tiles of rgb, seg, depth and flow, in the order in which they are drawn."""
     depth_colours = partial(depth_to_rgb, range_m=depth_range_m)
-    bar = partial(depth_bar, depth_range_m)
     tiles = {
-        "rgb": Tile("RGB", _picture, about="What the camera sees."),
-        "seg": Tile("segmentation", classes_to_rgb, about="The class of each pixel."),
-        "depth": Tile(
-            "depth, logarithmic",
-            depth_colours,
-            bar,
-            f"Distance along the view. Black: nothing within {depth_range_m:g} m.",
-        ),
-    }
-    about = {
-        "raw": "Motion of each pixel since the last step. Hue: direction.",
-        "ego": "The part of it that the camera's own motion causes.",
-        "obj": "The rest: what moves by itself.",
+        "rgb": Tile("RGB", _picture),
+        "seg": Tile("segmentation", classes_to_rgb),
+        "depth": Tile("depth, logarithmic", depth_colours, partial(depth_bar, depth_range_m)),
     }
     for name, scale_px in {**FLOW_SCALE_PX, **flow_scale_px}.items():
         draw = partial(flow_to_rgb, scale_px=scale_px)
-        note = flow_note(scale_px)
-        tiles[name] = Tile(f"{name} flow", draw, note, about.get(name, ""), is_flow=True)
+        tiles[name] = Tile(f"{name} flow", draw, flow_note(scale_px), is_flow=True)
     return tiles
 
 
@@ -203,19 +190,17 @@ def representation_strip(
     """
     if tiles is None:
         tiles = stock_tiles(flow_scale_px=flow_scale_px, depth_range_m=depth_range_m)
-    names, framed = set(maps.keys()), _listed(framed)
-    shown = {name: tile for name, tile in tiles.items() if name in names}
+    shown = {name: tile for name, tile in tiles.items() if name in maps.keys()}  # noqa: SIM118
     if not shown:
-        given = sorted(map(str, names))
+        given = sorted(map(str, maps.keys()))
         raise ValueError(f"nothing to draw: maps has {given}, expected some of {list(tiles)}")
     drawn = strip(
         {tile.label: tile.draw(maps[name]) for name, tile in shown.items()},
         wheel_for=[tile.label for tile in shown.values() if tile.is_flow],
         notes={tile.label: tile.note for tile in shown.values() if tile.note},
-        framed=[tile.label for name, tile in shown.items() if name in framed],
+        framed=[tile.label for name, tile in shown.items() if name in _listed(framed)],
     )
-    legend = class_legend(_listed(categories), drawn.shape[1])
-    return np.concatenate([drawn, legend])
+    return np.concatenate([drawn, class_legend(_listed(categories), drawn.shape[1])])
 
 
 @lru_cache(maxsize=64)
@@ -271,28 +256,26 @@ def strip(
     if any(h * width != w * height for h, w in sizes):
         raise ValueError(f"a strip needs images of one ratio of height to width, got {sizes}")
     zoom = tile_zoom(height, width)
+    height, width = zoom * height, zoom * width
     with_wheel, framed = _listed(wheel_for), _listed(framed)
-    # A column for each image: label, note (if any image has one, so that all stand level), image.
     columns: list[Image] = []
     for label, image in images.items():
-        bar = text_bar(label, width * zoom, _BAR_PX, size=18).copy()
-        if label in with_wheel and width * zoom >= _BAR_PX:
-            bar[1 : _BAR_PX - 1, -_BAR_PX:-2] = flow_wheel(_BAR_PX - 2)
-        column = [bar]
-        if notes.keys() & images.keys():
+        title = text_bar(label, width, _BAR_PX, size=18).copy()
+        if label in with_wheel and width >= _BAR_PX:
+            title[1 : _BAR_PX - 1, -_BAR_PX:-2] = flow_wheel(_BAR_PX - 2)
+        column = [title, resized(image, height, width)]
+        if notes.keys() & images.keys():  # below all labels, so that all images stand level
             note = notes.get(label, "")
             if isinstance(note, str):
-                column.append(text_bar(note, width * zoom, _NOTE_PX, colour=_NOTE_COLOUR))
+                bar = text_bar(note, width, _NOTE_PX, colour=_NOTE_COLOUR)
             else:
-                legend = note(width * zoom)
-                rows = (0, _NOTE_PX - len(legend)), (0, 0), (0, 0)
-                column.append(np.pad(legend, rows, constant_values=255))
-        column.append(resized(image, zoom * height, zoom * width))
+                bar = note(width)
+            rows = (0, _NOTE_PX - len(bar)), (0, 0), (0, 0)
+            column.insert(1, np.pad(bar, rows, constant_values=255))
         whole = np.concatenate(column)
         if framed:
-            colour = _FRAME_COLOUR if label in framed else (255, 255, 255)
             size = len(whole) + 2 * _FRAME_PX, whole.shape[1] + 2 * _FRAME_PX, 3
-            frame = np.full(size, colour, np.uint8)
+            frame = np.full(size, _FRAME_COLOUR if label in framed else 255, np.uint8)
             frame[_FRAME_PX:-_FRAME_PX, _FRAME_PX:-_FRAME_PX] = whole
             whole = frame
         columns += [whole, np.full((len(whole), _GAP_PX, 3), _GAP_GREY, np.uint8)]

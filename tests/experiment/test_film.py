@@ -8,7 +8,7 @@ from torchrl.data import Bounded
 pytest.importorskip("pybullet", reason="the simulated street is driven")
 
 from flowrep.experiment.agents import Agent
-from flowrep.experiment.film import LEGEND_S, Film, record_episode
+from flowrep.experiment.film import Film, record_episode
 from flowrep.transforms import Depth
 from flowrep.viz import OUTCOME_COLOURS
 from tests.config.composing import composed
@@ -138,8 +138,7 @@ def test_the_last_picture_shows_the_outcome_in_its_colour(film_of):
     film = film_of("representations=[seg]")
     frames, episode = film.drive({"episode_seed": 3})
     pictures = list(film.pictures(frames, episode))
-    legend = round(LEGEND_S * episode.fps)
-    assert len(pictures) == legend + episode.length + 12  # the last frame for a second
+    assert len(pictures) == episode.length + 12  # the last frame for a second
     assert {picture.shape for picture in pictures} == {pictures[0].shape}
     assert all((picture == pictures[-1]).all() for picture in pictures[-12:])
     colour = tuple(bytes.fromhex(OUTCOME_COLOURS["out_of_bounds"][1:]))
@@ -150,17 +149,6 @@ def test_the_last_picture_shows_the_outcome_in_its_colour(film_of):
     assert (pictures[-1][:-28] == bare[:-28]).all()
 
 
-def test_the_film_opens_with_a_legend_of_flow(film_of):
-    film = film_of("representations=[seg]")
-
-    def has_red():  # the wheel's: flow to the right, at its rim
-        return (np.abs(film.legend().astype(int) - (255, 0, 0)).max(-1) < 10).any()
-
-    assert has_red()
-    film.tiles = {name: film.tiles[name] for name in ("rgb", "seg")}
-    assert not has_red()
-
-
 def test_frames_of_a_stack_have_a_tile_each(film_of):
     film = film_of("representations=[depth2,seg2]", "representations.seg2.encoding=onehot")
     frames, _ = film.drive({"episode_seed": 3})
@@ -169,7 +157,8 @@ def test_frames_of_a_stack_have_a_tile_each(film_of):
     for name in ("depth", "seg"):  # oldest first; the newest is the exact one here
         torch.testing.assert_close(now[f"{name}2, 1 of 2"], before[name])
         torch.testing.assert_close(now[f"{name}2, 2 of 2"], now[name])
-    assert film.draw(frames[5]).shape == film.legend().shape
+    # ten tiles of 240 px, with 5 px around each and 4 px between
+    assert film.draw(frames[5]).shape[1] == 10 * 250 + 9 * 4
 
 
 class Nearness(Depth):
@@ -206,5 +195,5 @@ def test_a_recorded_episode_is_a_whole_film(tmp_path):
     episode = record_episode(agent, path, episode_seed=3, frame_rate_hz=6.0)
     assert episode.fps == 6.0
     played = imageio.imread(path, plugin="FFMPEG")
-    assert len(played) == 6 * LEGEND_S + episode.length + 6
+    assert len(played) == episode.length + 6
     assert [file.name for file in tmp_path.iterdir()] == ["episode.mp4"]
