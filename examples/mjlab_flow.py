@@ -1,6 +1,6 @@
 """Ego and object flow of wrist cameras in mjlab, for a batch of envs at once.
 
-    pip install '.[examples]' mjlab
+    pip install '.[examples]' 'mjlab>=1.6,<1.7'  # pins MuJoCo and MuJoCo Warp 3.11
     python examples/mjlab_flow.py strip.png
 
 It runs on a CPU, which mjlab supports "for development". At the first start, Warp compiles its

@@ -6,7 +6,7 @@ Adapters never write to the key that they read, so that nothing is converted twi
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import torch
 from tensordict import TensorDictBase
@@ -22,6 +22,10 @@ from flowrep.geometry.pose import POSE_SHAPES, check_pose_options
 from flowrep.transforms import base
 from flowrep.transforms.base import Keys, MapTransform, Reads, check_distinct_keys, flags_of_batch
 from flowrep.transforms.flow import CameraTransform, Intrinsics, masked_flow
+
+MapLayout: TypeAlias = Literal["hw", "hwc"]
+
+_OTHER_TYPE = 100_000  # more than the ids of bodies, so that InstanceIds names the others
 
 
 class AdaptDepth(CameraTransform):
@@ -235,6 +239,60 @@ class AdaptFlow(MapTransform):
         *batch, height, width, _ = flow.shape
         size = (*batch, 2, height, width) if self.channels_last else flow.shape
         return (Unbounded(size, device=flow.device, dtype=flow.dtype),)
+
+
+class Plane(MapTransform):
+    """A picture of depth or ids as a map `[*B, 1, H, W]`.
+
+    | reads | writes | shape | range | unit |
+    | --- | --- | --- | --- | --- |
+    | `[*B, H, W]` or `[*B, H, W, C]` | one key | `[*B, 1, H, W]` | as read | |
+
+    Unsigned integers of 16 bits and more become int64, as PyTorch hardly computes with them.
+
+    Args:
+        layout: `"hw"` or `"hwc"`, of one channel, or of an id and its type.
+        type: the type of bodies. The id i of another type t becomes 100,000 (1 + t) + i, so that
+            it isn't taken for a body's; negative ids, where nothing is, stay.
+        if_colours: of ids: what to do if they are colours, which have more channels.
+
+    Raises:
+        ValueError: the picture has other channels.
+    """
+
+    def __init__(
+        self, layout: MapLayout, *, type: int | None = None, if_colours: str = "",
+        in_keys: Keys, out_keys: Keys,
+    ) -> None:  # fmt: skip
+        channels = () if layout == "hw" else (1,) if type is None else (2,)
+        super().__init__([Reads(("H", "W", *channels))], in_keys, out_keys)
+        self.type, self.if_colours = type, if_colours
+
+    def _inputs(self, source: Any) -> list[Any]:
+        picture = source.get(self.in_keys[0], None)
+        if picture is not None and self.if_colours:
+            # The last size is a channel's, or the width of a picture without channels.
+            *_, last = picture.shape
+            if last in (3, 4) and picture.dtype is torch.uint8:
+                says = f"holds colours, {picture.dtype} {list(picture.shape)}, which are no ids"
+                raise ValueError(f"{self.in_keys[0]!r} {says}: {self.if_colours}")
+        return super()._inputs(source)
+
+    def compute(self, picture: Tensor) -> tuple[Tensor]:
+        """Returns the map."""
+        picture = picture.to(base.signed(picture.dtype))
+        ids = picture[..., 0] if len(self.reads[0].shape) == 3 else picture
+        if self.type is not None:
+            kind = picture[..., 1]
+            other = torch.where(ids < 0, ids, _OTHER_TYPE * (1 + kind) + ids)
+            ids = torch.where(kind == self.type, ids, other)
+        return (ids.unsqueeze(-3),)
+
+    def output_specs(self, picture: TensorSpec) -> tuple[TensorSpec]:
+        """Returns an unbounded spec."""
+        *batch, height, width = picture.shape[: picture.ndim - len(self.reads[0].shape) + 2]
+        shape = (*batch, 1, height, width)
+        return (Unbounded(shape, device=picture.device, dtype=base.signed(picture.dtype)),)
 
 
 class BodyRows:

@@ -36,12 +36,21 @@ renderer.close()
 RECORD = """
 import math, sys
 import mujoco, torch
+from examples import mujoco_flow
 from examples.mujoco_flow import K, Yard, make_env
 
-env = make_env()
-frames = env.rollout(10, policy=lambda td: td.set("action", torch.tensor(1)))["next"]
-record = {"frames": frames.to_dict(), "K": K}
-env.close()
+def recorded(steps):
+    env = make_env()
+    frames = env.rollout(steps, policy=lambda td: td.set("action", torch.tensor(1)))["next"]
+    env.close()
+    return frames.to_dict()
+
+record = {"frames": recorded(10), "K": K}
+scene = mujoco_flow.SCENE
+markers = "".join(f"<site pos='{x} 3 .3' size='.2'/>" for x in range(-4, 4))
+mujoco_flow.SCENE = scene.replace("</worldbody>", markers + "</worldbody>")
+record["marked"] = recorded(2)
+mujoco_flow.SCENE = scene
 
 yard = Yard()
 yard.reset(seed=0)
@@ -118,6 +127,16 @@ def test_each_frame_warps_into_the_one_before_and_only_what_moves_lights_up(reco
     assert body.unique().tolist() == [0, 1, 2, 3]  # the ball, the door and the crate
     for i in (1, 2, 3):
         assert speed[body == i].median() > 0.3
+
+
+def test_a_marker_with_the_number_of_a_body_s_geom_is_not_that_body(record):
+    plain, marked = (TensorDict(record[name], [n]) for name, n in (("frames", 10), ("marked", 2)))
+    is_site = marked["segmentation"][..., 1] == 6  # mjOBJ_SITE
+    numbers = marked["segmentation"][..., 0][is_site].unique().tolist()
+    assert {*numbers} & {*plain["segmentation"][..., 0].unique().tolist()}
+    seen = marked["sensor", "instance"][:, 0]
+    assert (seen[is_site] == 0).all()
+    assert (seen == plain["sensor", "instance"][:2, 0])[~is_site].all()
 
 
 def test_the_example_runs_and_writes_its_strip(backend, tmp_path):

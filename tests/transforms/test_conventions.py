@@ -102,13 +102,15 @@ def names(body, background):
 def isaac_lab(t, quaternion=xyzw):
     z, body, camera, bodies = scene(t)
     u, v = np.moveaxis(truth(t) if t else np.zeros((HEIGHT, WIDTH, 2)), -1, 0)
+    ids = names(body, 1)[..., None].astype(np.int32)
     return {
         "distance_to_image_plane": z[..., None].astype(np.float32),
         "distance_to_camera": ray_lengths(z)[..., None].astype(np.float32),
         "pos_w": camera[:3, 3].astype(np.float32),
         "quat_w_ros": quaternion(camera).astype(np.float32),  # ROS's camera is OpenCV's
         "body_link_pose_w": seven(bodies, quaternion),
-        "instance_id_segmentation_fast": names(body, 1)[..., None].astype(np.int32),
+        "instance_segmentation": ids,  # 3.0's
+        "instance_id_segmentation_fast": ids,  # 2.x's
         # left and up are positive
         "motion_vectors": np.stack([-u, -v], -1).astype(np.float32),
     }
@@ -356,7 +358,7 @@ DEPTHS = [
 
 @pytest.mark.parametrize(("simulator", "depth"), DEPTHS)
 def test_the_other_kinds_of_depth_become_the_same(simulator, depth):
-    needed = {"intrinsics"} & set(CONVENTIONS[simulator].depth[depth].values())
+    needed = {"intrinsics"} & set(CONVENTIONS[simulator].depth[depth])
     given = {k: v for k, v in ARGUMENTS.get(simulator, {}).items() if k != "intrinsics"}
     given |= dict.fromkeys(needed, K)
     assert_is_the_truth(rollout(simulator, depth=depth, body_ids=IDS, **given))
@@ -384,13 +386,45 @@ def test_the_quaternions_of_another_version_give_other_flow(written, read):
 
 
 @pytest.mark.parametrize("depth", ["distance_to_image_plane", "distance_to_camera"])
-def test_isaac_labs_depth_may_be_clipped_to_zero(depth):
+@pytest.mark.parametrize(("background_m", "options"), [(0.0, {}), (50.0, {"far_m": 50.0})])
+def test_isaac_labs_depth_may_be_clipped_to_zero_or_to_the_far_plane(depth, background_m, options):
     def clipped(t):
-        buffers = isaac_lab(t)  # depth_clipping_behavior="zero"
-        return buffers | {depth: np.where(np.isinf(buffers[depth]), 0, buffers[depth])}
+        buffers = isaac_lab(t)  # zero is Newton Warp's background without clipping, too
+        return buffers | {depth: np.where(np.isinf(buffers[depth]), background_m, buffers[depth])}
 
     rays = {"intrinsics": K} if depth == "distance_to_camera" else {}
-    assert_is_the_truth(rollout("isaac_lab", clipped, depth=depth, body_ids=IDS, **rays))
+    options = options | rays
+    assert_is_the_truth(rollout("isaac_lab", clipped, depth=depth, body_ids=IDS, **options))
+
+
+@pytest.mark.parametrize("simulator", CONVENTIONS)
+def test_colours_are_not_taken_for_ids(simulator):
+    row = CONVENTIONS[simulator]
+
+    def colourful(t):
+        colours = np.random.default_rng(t).integers(0, 256, (HEIGHT, WIDTH, 4), dtype=np.uint8)
+        return WRITERS[simulator](t) | {row.ids["key"]: colours}
+
+    with pytest.raises(ValueError, match=re.escape(row.ids["if_colours"])):
+        rollout(simulator, colourful, body_ids=IDS, **ARGUMENTS.get(simulator, {}))
+
+
+@pytest.mark.parametrize(("simulator", "other"), [("mujoco", 6), ("mjlab", 9)])  # a site, a flex
+def test_what_is_no_geom_is_not_a_body_and_is_named(simulator, other):
+    def with_marker(t):
+        buffers = WRITERS[simulator](t)
+        segmentation = buffers["segmentation"].copy()
+        segmentation[4, :3] = IDS[0], other  # its number is that of the first body's geom
+        return buffers | {"segmentation": segmentation}
+
+    with pytest.warns(UserWarning, match=f"{100_000 * (1 + other) + IDS[0]} "):
+        frames = rollout(simulator, with_marker, body_ids=IDS, **ARGUMENTS.get(simulator, {}))
+    assert (frames["sensor", "instance"][:, 0, 4, :3] == 0).all()
+    assert (frames["obj"][:, :, 4, :3] == 0).all()
+    body = scene(1)[1]
+    others = np.delete(body.ravel(), range(4 * WIDTH, 4 * WIDTH + 3)) + 1
+    seen = frames["sensor", "instance"][0].numpy().ravel()
+    assert np.delete(seen, range(4 * WIDTH, 4 * WIDTH + 3)).tolist() == others.tolist()
 
 
 def test_keys_may_be_elsewhere():
@@ -499,8 +533,9 @@ def assert_warps(simulator, frames, K, differing=0.0, **options):
     td.names = ["time"]
     sensors = sensors_from(simulator, prefix="camera", **options)
     td = Compose(*sensors, RawFlow(K), FlowFactorize(K))(td)
-    (background,) = CONVENTIONS[simulator].background or (-1,)
-    sky = td["adapted", CONVENTIONS[simulator].ids][:, 0] == background
+    ids = CONVENTIONS[simulator].ids
+    (background,) = ids["background"] or (-1,)
+    sky = td["adapted", ids["key"]][:, 0] == background
     is_inf = td["sensor", "depth"].isinf()[:, 0]
     assert sky.any()
     assert (is_inf != sky).float().mean() <= differing
