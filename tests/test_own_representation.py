@@ -152,6 +152,7 @@ def test_from_the_command_line(folder):
 
     done = run(
         "train", "--config-dir", "my_configs", "representations=[ego,edges]", "debug=smoke",
+        TYPED.lstrip("+"),
         "device=cpu", "representations.edges.factor=8", "hydra.run.dir=run", "total_frames=64",
         "scene.time_limit_steps=20", "evaluation.speeds=[low]", "evaluation.baselines=[]",
     )  # fmt: skip

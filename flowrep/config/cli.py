@@ -35,7 +35,8 @@ from yaml import YAMLError
 
 from flowrep import __version__
 from flowrep.config import CONF_DIR, config_groups, group_choices
-from flowrep.config.schema import Command, TrainConfig, validated
+from flowrep.config.foreign import checked_files
+from flowrep.config.schema import ALGORITHMS, Command, TrainConfig, named_classes, validated
 from flowrep.usage import UsageError, closest_first
 
 EXIT_USAGE = 2
@@ -71,7 +72,8 @@ def run_hydra(config_name: str, job: Callable[[DictConfig], Any], schema: type[C
     try:
         sys.argv[1:] = as_typed(sys.argv[1:], schema)
         _show_if_asked(sys.argv[1:], config_name)
-        with env_override({"HYDRA_FULL_ERROR": "1"}):  # Hydra raises its errors, not prints them
+        # Hydra raises its errors, not prints them.
+        with env_override({"HYDRA_FULL_ERROR": "1"}), checked_files():
             main(job)()
     except KeyboardInterrupt:
         sys.exit(130)
@@ -90,7 +92,11 @@ def composed(values: Mapping[str, Any]) -> tuple[TrainConfig, str, list[str]]:
     typed = list(_overrides(values))
     register_resolvers()
     try:
-        with _own_hydra(), hydra.initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+        with (
+            _own_hydra(),
+            checked_files(),
+            hydra.initialize_config_dir(str(CONF_DIR), version_base="1.3"),
+        ):
             config = hydra.compose("train", typed, return_hydra_config=True)
         return checked(config, TrainConfig), str(config.hydra.run.dir), typed
     except (HydraException, OmegaConfBaseException, ValueError) as error:
@@ -163,6 +169,13 @@ def checked(config: DictConfig, schema: type[Command]) -> Any:
     keys = [text.partition("=")[0].rpartition("@")[2] for text in typed]  # +group@key=choice
     for key in (model.model_extra or {}).keys() - {key.lstrip("+").split(".")[0] for key in keys}:
         raise UsageError(_unknown_key(key, schema))
+    words = {word for text in typed if "_target_" in text for word in re.split(r"[^\w.]", text)}
+    for key, target in named_classes(model).items():
+        if target not in (*ALGORITHMS, *words):
+            raise UsageError(
+                f"{key}={target} is code outside of flowrep, which a file can't have run: if you "
+                f"trust it, add {key}={target}"
+            )
     choice = str(job.runtime.choices.get("scene") or "").rpartition("/")[2]
     name = (plain.get("scene") or {}).get("name")
     is_typed = any(text.startswith("scene.name=") for text in typed)

@@ -83,9 +83,17 @@ class Command(Options):
     @property
     def trusted(self) -> list[str]:
         """The classes outside of flowrep that it names; a stored run may name these, too."""
-        plain = self.plain()
-        sections = [plain.get("algorithm") or {}, *(plain.get("representations") or {}).values()]
-        return [section["_target_"] for section in sections if section.get("_target_")]
+        return [*named_classes(self).values()]
+
+
+def named_classes(config: Command) -> dict[str, str]:
+    """Returns the classes that a config names, by the keys with which they are typed."""
+    plain = config.plain()
+    sections = {"algorithm": plain.get("algorithm") or {}}
+    for name, options in (plain.get("representations") or {}).items():
+        sections[f"representations.{name}"] = options
+    targets = {f"{name}._target_": each.get("_target_") for name, each in sections.items()}
+    return {key: target for key, target in targets.items() if target}
 
 
 def _in_their_order(value: Any, check: Any) -> dict[str, Any]:
@@ -425,18 +433,13 @@ def validated_run(plain: Any, source: str, trusted: Collection[str] = ()) -> Tra
     if not isinstance(plain, Mapping):
         raise UsageError(f"{source} does not hold a run's config: restore the file")
     config = validated(TrainConfig, plain, source)
-    named = {"algorithm": config.algorithm.target}
-    named |= {
-        f"+representations.{name}": options["_target_"]
-        for name, options in config.representations.items()
-        if "_target_" in options
-    }
     known = {*ALGORITHMS, *([trusted] if isinstance(trusted, str) else trusted)}
-    for key, target in named.items():
+    for key, target in named_classes(config).items():
         if target not in known:
+            plus = "+" if key.startswith("representations") else ""  # no map of this command
             raise UsageError(
                 f"{source} names code outside of flowrep, {target}: if you trust it, add "
-                f"{key}._target_={target}"
+                f"{plus}{key}={target}"
             )
     return config
 

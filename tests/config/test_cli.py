@@ -16,35 +16,8 @@ from omegaconf import OmegaConf
 import flowrep
 from flowrep.config import CONF_DIR, cli, schema
 from flowrep.usage import UsageError
+from tests.config.conftest import SCHEMAS
 from tests.running import run_python
-
-SCHEMAS = {
-    "train": schema.TrainConfig,
-    "evaluate": schema.EvaluateConfig,
-    "factorize": schema.FactorizeConfig,
-    "report": schema.ReportConfig,
-    "view": schema.ViewConfig,
-    "export": schema.ExportConfig,
-}
-
-
-@pytest.fixture
-def run(monkeypatch, capsys, tmp_path):
-    """Runs a command line up to the command; returns exit code, config and output."""
-
-    def run(command, *arguments):
-        found = []
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", ["flowrep-train", *arguments])
-        code = 0
-        try:
-            cli.run_command(command, found.append, SCHEMAS[command])
-        except SystemExit as end:
-            code = end.code
-        return code, found, capsys.readouterr()
-
-    return run
-
 
 MISTAKES = [
     # a choice that doesn't exist
