@@ -5,7 +5,8 @@ the episodes that all compared runs drove.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from datetime import datetime
 from fnmatch import fnmatch
 from itertools import chain, count
 from typing import Any, NamedTuple
@@ -41,6 +42,28 @@ def studies_of(declared: Mapping[str, Any], runs: Sequence[Run]) -> Studies:
         study: {s: of for s, patterns in of_scenes.items() if (of := finished(patterns))}
         for study, of_scenes in declared["studies"].items()
     }
+
+
+def undated(declared: Mapping[str, Any], studies: Studies) -> list[str]:
+    """Returns the studies whose runs don't say when they started, as older ones.
+
+    Raises:
+        ValueError: a run started before the rules of its study were committed.
+    """
+    missing = []
+    for study, of_scenes in studies.items():
+        runs = [*chain(*of_scenes.values())]
+        if any("started" not in run.machine for run in runs):
+            missing.append(study)
+        since = declared.get("committed", {}).get(study)
+        for run in runs:
+            started = run.machine.get("started")
+            if since and started and datetime.fromisoformat(started) < since:
+                raise ValueError(
+                    f"{study}: {run.name} started at {started}, before its rules were committed at "
+                    f"{since}: run it again, or correct `committed` in claims.yaml"
+                )
+    return missing
 
 
 @dataclass
@@ -98,11 +121,35 @@ def claims_of(
         return Claim(next(numbers), entry["claim"], entry["limits"], contrasts)
 
     primary, secondary = (list(map(claim, declared[of])) for of in ("primary", "secondary"))
-    together = [contrast for claim in primary for contrast in claim.contrasts]
-    corrected = (holm([getattr(c, name) for c in together]) for name in ("p_value", "p_against"))
-    for contrast, p_value, p_against in zip(together, *corrected):
-        contrast.p_value, contrast.p_against = p_value, p_against
+    _correct([contrast for claim in primary for contrast in claim.contrasts])
     return primary, secondary
+
+
+def at_length(declared: Mapping[str, Any], studies: Studies) -> dict[int, Contrast]:
+    """Returns contrasts of the paper's number of frames, paired by seed, by the row of the claim.
+
+    Each family has a correction of its own.
+    """
+    asked, found = declared.get("at_length", {"families": []}), {}
+    entries = [*declared["primary"], *declared["secondary"]]
+    for family in asked["families"]:
+        contrasts = [
+            contrast_of(
+                entries[row - 1]["contrasts"][0] | {"paired": True, "scenes": asked["scenes"]},
+                studies[asked["study"]],
+                asked["scenes"],
+            )
+            for row in family
+        ]
+        _correct(contrasts)
+        found |= dict(zip(family, contrasts))
+    return {row: contrast for row, contrast in found.items() if contrast.effect}
+
+
+def _correct(contrasts: Sequence[Contrast]) -> None:
+    corrected = (holm([getattr(c, name) for c in contrasts]) for name in ("p_value", "p_against"))
+    for contrast, p_value, p_against in zip(contrasts, *corrected):
+        contrast.p_value, contrast.p_against = p_value, p_against
 
 
 def contrast_of(
@@ -122,7 +169,13 @@ def contrast_of(
 
 def _sides(asked: Mapping[str, Any], runs: Sequence[Run]) -> list[list[Run]]:
     stacks = [asked[side] for side in ("first", "second") if side in asked]
-    return [[run for run in runs if run.stack == stack] for stack in stacks]
+    sides = [[run for run in runs if run.stack == stack] for stack in stacks]
+    if asked.get("paired"):
+        seeds = set.intersection(*({run.seed for run in side} for side in sides))
+        return [
+            sorted((r for r in side if r.seed in seeds), key=lambda r: r.seed) for side in sides
+        ]
+    return sides
 
 
 def _over(
@@ -132,13 +185,19 @@ def _over(
     if not {*chosen} <= {*strata}:
         return Contrast(asked, None, by_scene, float("nan"), float("nan"))
     pairs = [sides for scene in chosen for sides in strata[scene]]
-    together = effect(pairs)
+    together = _of_seeds(pairs) if asked.get("paired") else effect(pairs)
     if asked["expect"] == "equal":
         p_values = together.p_within(asked["margin"]), together.p_beyond(asked["margin"])
     else:
         p_values = together.p_value, together.p_value
     higher = improvement(pairs) if "second" in asked else float("nan")
     return Contrast(asked, together, by_scene, *p_values, higher)
+
+
+def _of_seeds(strata: Sequence[Sequence[Array]]) -> Effect:
+    """Returns the effect of differences between runs of one seed, in the mean over strata."""
+    differences = [np.subtract(*sides) if len(sides) == 2 else sides[0] for sides in strata]
+    return effect([[np.mean(differences, axis=0)]])
 
 
 class Cell(NamedTuple):
@@ -190,10 +249,43 @@ def held_out_claims(declared: Mapping[str, Any], cells: Sequence[Cell]) -> list[
         first, second = (sum(map(is_collapsed, chain(*of_cells))) for of_cells in sides)
         claim = Claim(number, asked["claim"], "", [contrast])
         found.append(HeldOut(claim, p, (first, second), _over(asked, without, names)))
-    together = [each.claim.contrasts[0] for each in found]
-    for contrast, p in zip(together, holm([contrast.p_value for contrast in together])):
-        contrast.p_value = contrast.p_against = p
+    _correct([each.claim.contrasts[0] for each in found])
     return found
+
+
+def sensitivity(asked: Mapping[str, Any], cells: Sequence[Cell]) -> dict[str, Contrast]:
+    """Returns a claim on held-out speeds in other ways: what it decides hangs on which of them.
+
+    Without the seed, and without the split and scene, whose absence raises p most; and paired by
+    seed. Their p values are not corrected.
+    """
+
+    def over(of: Sequence[Cell], asked: Mapping[str, Any] = asked) -> Contrast:
+        rates = _rates(asked, of, lambda cell: {cell.mode: 1})
+        return _over(asked, rates, [cell.name for cell in of])
+
+    def dropped(
+        drop: Callable[[Any], Sequence[Cell]], names: Iterable[Any]
+    ) -> tuple[str, Contrast]:
+        found = {str(name): over(drop(name)) for name in names}
+        return max(found.items(), key=lambda item: np.nan_to_num(item[1].p_value, nan=-1))
+
+    seeds = sorted({run.seed for cell in cells for run in cell.runs})
+    seed, no_seed = dropped(
+        lambda name: [c._replace(runs=[r for r in c.runs if r.seed != name]) for c in cells], seeds
+    )
+    cell, no_cell = dropped(
+        lambda name: [c for c in cells if c.name != name], [c.name for c in cells]
+    )
+    paired = over(cells, asked | {"paired": True})
+    each = np.array([found.value for found in over(cells).by_scene.values()])
+    sampled = effect([[each]])
+    return {
+        seed: no_seed,
+        cell: no_cell,
+        "paired by seed": paired,
+        "panels as a sample": replace(paired, effect=sampled, p_value=sampled.p_value),
+    }
 
 
 def beside_held_out(

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -21,7 +21,6 @@ from scipy import stats
 from flowrep.report.figures import draw_bars, encoded, styled, words
 from flowrep.report.page import TEMPLATES
 from flowrep.report.runs import (
-    SCENES,
     SPEEDS,
     STACKS,
     Condition,
@@ -46,6 +45,7 @@ from paper.claims import (
     Contrast,
     HeldOut,
     Studies,
+    at_length,
     beside_held_out,
     claims_of,
     conditions_of,
@@ -54,7 +54,9 @@ from paper.claims import (
     held_out_claims,
     measure_of,
     scores,
+    sensitivity,
     studies_of,
+    undated,
 )
 
 HERE = Path(__file__).parent
@@ -69,13 +71,26 @@ _DISTILLED_CONTRASTS = (
 # Success [R, 3] at low, normal and high speed, by what runs learn from, people's speeds in training
 # and stack.
 Learned = Mapping[tuple[str, str, str], Array]
-_COLOURS = dict(zip(SCENES, ("#0072b2", "#e69f00", "#009e73", "#cc79a7")))
+_COLOURS = ("#999999", "#56b4e9", "#0072b2", "#009e73", "#d55e00", "#cc79a7")
+_BOUNDS = ("effect", "low", "high")
+_ROW_OF_SIDES = {("ego+obj", "raw"): 6, ("ego+obj+seg2", "seg2"): 7, ("ego+obj+seg2", "ego+obj"): 8}
 _STUDY = {"resolution": ", 84 px", "wide_confirmation": ", 0.6–2.4 m/s"}  # in the figure
 _TIED = "\u00a0"  # a space at which no line breaks
-_WIDEST = 80  # points, where the figure's axis ends
 _POWER = 0.8
 _FOUND = 0.5  # a run finds a way if it succeeds in this share of its episodes
 _HARDLY_EVER = 0.05  # success at the training speed
+
+
+class Answer(NamedTuple):
+    """What a study says about a claim."""
+
+    difference: Estimate
+    verdict: str
+    note: str = ""  # people's speeds in training, if the column has several
+
+
+Answers = Mapping[int, Sequence[Answer]]
+"""Of one study, by the claim's row."""
 
 
 def _as_trained(run: Run) -> Condition:
@@ -133,8 +148,7 @@ def recipes_table(
 
 
 def _verdict_on(claim: Claim) -> tuple[str, str]:
-    verdict = claim.verdict.removesuffix(" with this recipe")
-    return effect_text(claim.contrasts[0]), f"**{verdict}**"
+    return effect_text(claim.contrasts[0]), f"**{_short(claim.verdict)}**"
 
 
 def held_out_table(found: Sequence[HeldOut]) -> str:
@@ -154,6 +168,17 @@ def held_out_table(found: Sequence[HeldOut]) -> str:
     header = ("", "claim", "verdict", "effect [95 %], p (Holm)", "p by permutation")
     header += ("by split and scene", *(("collapsed", "without these") if some_collapsed else ()))
     return _table(header, rows)
+
+
+def sensitivity_table(found: Mapping[int, Mapping[str, Contrast]]) -> str:
+    """Returns the claims on held-out speeds in other ways, uncorrected."""
+    rows = []
+    for number, of in found.items():
+        (seed, panel, *others), effects = of, map(effect_text, of.values())
+        rows.append(
+            (f"H{number}", f"{seed}: {next(effects)}", f"{panel}: {next(effects)}", *effects)
+        )
+    return _table(("", "without seed", "without panel", *others), rows)
 
 
 def beside_table(found: Sequence[Mapping[str, Contrast]]) -> str:
@@ -312,29 +337,77 @@ def effect_text(contrast: Contrast) -> str:
     return ", ".join(part.replace(" ", _TIED) for part in parts)
 
 
-def draw_claims(claims: Sequence[Claim]) -> Figure:
-    """Returns the forest plot: each contrast's effect over scenes, and by scene beside it."""
-    rows = [(claim, contrast) for claim in claims for contrast in claim.contrasts]
+def answers_table(rows: Sequence[Claim], answers: Mapping[str, Answers]) -> str:
+    """Returns the paper's claims with the verdict of each study, and the difference in points."""
+
+    def cell(found: Sequence[Answer]) -> str:
+        return "<br>".join(
+            f"**{verdict}** {points(value)}{f', {note}' if note else ''}"
+            for value, verdict, note in found
+        )
+
+    cells = [[cell(of.get(row.number, ())) for of in answers.values()] for row in rows]
+    named = [(str(row.number), row.text, *of) for row, of in zip(rows, cells)]
+    return _table(("", "the paper's claim", *answers), named)
+
+
+def answers_of(
+    primary: Sequence[Claim],
+    earlier: Mapping[int, Mapping[str, str]],
+    later: Sequence[Claim],
+    led: Mapping[tuple[str, str, str, str], Effect],
+    held_out: Sequence[HeldOut],
+    long: Mapping[int, Contrast],
+) -> dict[str, Answers]:
+    """Returns what each study says about the paper's claims, by claim."""
+
+    def of(contrast: Contrast) -> list[Answer]:
+        assert contrast.effect is not None
+        return [Answer(contrast.effect.interval(), _short(contrast.verdict))]
+
+    first = {
+        row: [Answer(Estimate(*(float(it[x]) / 100 for x in _BOUNDS)), it["verdict"])]
+        for row, it in earlier.items()
+    }
+    by_labels: dict[int, list[Answer]] = {}
+    for (source, trained_at, *sides), found in led.items():
+        if source == "labels" and tuple(sides) in _ROW_OF_SIDES:
+            verdict = _short(found.verdict_on("more", found.p_value, found.p_value))
+            answer = Answer(found.interval(), verdict, f"{trained_at} m/s")
+            by_labels.setdefault(_ROW_OF_SIDES[sides[0], sides[1]], []).insert(0, answer)
+    return {
+        "recipe 1": first,
+        "recipe 2": {claim.number: of(claim.contrasts[0]) for claim in primary},
+        "recipe 3": {claim.number: of(claim.contrasts[0]) for claim in later},
+        "labels": by_labels,
+        "held-out": {n: of(each.claim.contrasts[0]) for n, each in zip((6, 7, 8), held_out)},
+    } | ({"two million frames": {row: of(each) for row, each in long.items()}} if long else {})
+
+
+def _short(verdict: str) -> str:
+    return verdict.removesuffix(" with this recipe")
+
+
+def draw_answers(rows: Sequence[Claim], answers: Mapping[str, Answers]) -> Figure:
+    """Returns the forest plot: the difference of each claim, a colour for each study."""
     with styled(8.0):
-        figure = Figure(figsize=(7.4, 0.42 * len(rows) + 1.0), layout="constrained")
+        figure = Figure(figsize=(7.4, 0.5 * len(rows) + 1.0), layout="constrained")
         axes = figure.add_subplot()
         axes.axvline(0, color="#6b7480", linewidth=0.8)
-        for row, (_, contrast) in enumerate(rows):
-            for index, (scene, colour) in enumerate(_COLOURS.items()):
-                if scene in contrast.by_scene:
-                    at = row + 0.1 + 0.15 * index
-                    _draw_effect(axes, contrast.by_scene[scene], at, colour, "o", 3.5)
-            if contrast.effect is not None:
-                _draw_effect(axes, contrast.effect, row - 0.12, "#1b1f24", "D", 5.0)
-        axes.set_yticks(range(len(rows)), [_label(*row) for row in rows])
-        axes.set_ylim(len(rows) - 0.3, -0.7)
-        axes.set_xlim(-_WIDEST, _WIDEST)
+        for study, ((name, of), colour) in enumerate(zip(answers.items(), _COLOURS)):
+            axes.plot([], [], color=colour, marker="o", label=name)
+            for at, row in enumerate(rows):
+                for nth, (value, _, note) in enumerate(of.get(row.number, ())):
+                    face = "white" if note.startswith("0.6") else colour  # not the paper's speeds
+                    y = at + 0.13 * (study - 2) + 0.05 * nth
+                    ends = 100 * value.low, 100 * value.high
+                    axes.plot(ends, [y, y], color=colour, linewidth=1.2)
+                    axes.plot(100 * value.value, y, "o", color=colour, mfc=face, markersize=4.0)
+        axes.set_yticks(range(len(rows)), [_label(row, row.contrasts[0]) for row in rows])
+        axes.set_ylim(len(rows) - 0.5, -0.5)
         axes.grid(axis="x")
-        axes.set_xlabel("points (95 % intervals; an arrow where one goes on)")
-        for scene, colour in _COLOURS.items():
-            axes.plot([], [], color=colour, marker="o", label=words(scene))
-        axes.plot([], [], color="#1b1f24", marker="D", label="over scenes")
-        figure.legend(loc="outside upper center", ncols=5)
+        axes.set_xlabel("points (95 % intervals)")
+        figure.legend(loc="outside upper center", ncols=6)
     return figure
 
 
@@ -348,20 +421,6 @@ def _label(claim: Claim, contrast: Contrast) -> str:
         what = (" − " if min(asked[kind].values()) < 0 else " and ").join(units)
     study = _STUDY.get(asked.get("study", ""), "")
     return f"{claim.number}  {' − '.join(names)}, {what}{study}"
-
-
-def _draw_effect(
-    axes: Any, drawn: Effect, at: float, colour: str, marker: str, size: float
-) -> None:
-    value, low, high = (100 * number for number in drawn.interval())
-    axes.plot(value, at, marker, color=colour, markersize=size)
-    if np.isnan(low):
-        return
-    ends = [max(low, -_WIDEST), min(high, _WIDEST)]
-    axes.plot(ends, [at, at], color=colour, linewidth=1.2)
-    for end, is_cut, sign in ((-_WIDEST, low < -_WIDEST, "<"), (_WIDEST, high > _WIDEST, ">")):
-        if is_cut:
-            axes.plot(end, at, sign, color=colour, markersize=3.0, clip_on=False)
 
 
 def without(left_out: Sequence[Run], declared: Mapping[str, Any], studies: Studies) -> list[str]:
@@ -591,10 +650,13 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
     by_rewards = rewarded(studies["laptop"].get("straight_road", []), stacks_with_labels)
     learned = {**by_labels, **by_rewards}
     led = learned_effects(learned)
-    figures = {FIGURE: draw_claims([*primary, *secondary])}
-    if cells:
-        figures[HELD_OUT_FIGURE] = draw_held_out(cells)
     held_out, others = held_out_claims(declared, cells), beside_held_out(declared, cells)
+    later, long = in_its_scenes("laptop"), at_length(declared, studies)
+    answers = answers_of(primary, earlier, later, led, held_out, long)
+    figures = {FIGURE: draw_answers(primary, answers), HELD_OUT_FIGURE: draw_held_out(cells)}
+    in_other_ways = {
+        n: sensitivity(each.claim.contrasts[0].asked, cells) for n, each in enumerate(held_out, 1)
+    }
     detectable = smallest_differences(primary)
     text = (
         TEMPLATES.overlay(loader=FileSystemLoader(HERE))
@@ -604,12 +666,15 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
             secondary=claims_table(secondary),
             detectable=detectable,
             decisive=len(decisive),
-            recipes=recipes_table(primary, earlier, in_its_scenes("laptop")),
+            answers=answers_table(primary, answers),
+            sensitivity=sensitivity_table(in_other_ways),
+            undated=[study.replace("_", " ") for study in undated(declared, studies)],
+            recipes=recipes_table(primary, earlier, later),
             later_scenes=[words(scene) for scene in studies["laptop"]],
-            held_out=held_out_table(held_out) if cells else "",
+            held_out=held_out_table(held_out),
             effects=[_points(each.claim.contrasts[0]) for each in held_out],
             any_collapsed=any(number for each in held_out for number in each.collapsed),
-            beside=beside_table(others) if cells else "",
+            beside=beside_table(others),
             others=[{name: _points(c) for name, c in of.items()} for of in others],
             held_out_runs=sum(len(cell.runs) for cell in cells),
             above=above_the_planner(cells),

@@ -171,9 +171,11 @@ def _machine(path: Path) -> dict[str, str]:
     try:
         machines = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
         values = {key: dict.fromkeys(str(each.get(key)) for each in machines) for key in _MACHINE}
-    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+        ends = [("started", machines[0]), ("ended", machines[-1])] if machines else []
+        times = {key: str(machine[key]) for key, machine in ends if machine.get(key)}
+    except (ValueError, TypeError, AttributeError, RecursionError, LookupError) as error:
         raise ValueError(f"{path.name}: {error}") from error
-    return {key: " | ".join(names) or "unknown" for key, names in values.items()}
+    return {key: " | ".join(names) or "unknown" for key, names in values.items()} | times
 
 
 def without_repeats(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
