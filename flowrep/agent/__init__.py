@@ -4,9 +4,14 @@ from flowrep.extras import require
 
 require("flowrep.agent", "train", "safetensors", "pydantic")
 
-from flowrep.agent.algorithm import Algorithm, DivergenceError
+from flowrep.agent.algorithm import (
+    Algorithm,
+    DivergenceError,
+    OffPolicy,
+    keep_freed_memory,
+    torch_threads,
+)
 from flowrep.agent.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
-from flowrep.agent.cpu import keep_freed_memory, torch_threads
 from flowrep.agent.dqn import DoubleDQN
 from flowrep.agent.dsac import DiscreteSAC
 from flowrep.agent.dsac_v import DiscreteSACWithValue
@@ -15,6 +20,6 @@ from flowrep.agent.replay import ReplayMemory
 
 __all__ = [
     "PPO", "Algorithm", "CheckpointError", "DiscreteSAC", "DiscreteSACWithValue", "DivergenceError",
-    "DoubleDQN", "ReplayMemory", "keep_freed_memory", "load_checkpoint",
+    "DoubleDQN", "OffPolicy", "ReplayMemory", "keep_freed_memory", "load_checkpoint",
     "save_checkpoint", "torch_threads",
 ]  # fmt: skip

@@ -1,24 +1,38 @@
-"""The interface between training and an algorithm, and the update that all algorithms share."""
+"""The update that all algorithms share, and what training calls.
+
+`OffPolicy` adds a replay memory; the losses are in a file per algorithm.
+"""
 
 from __future__ import annotations
 
+import ctypes
 import math
+import platform
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, ClassVar
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import CudaGraphModule
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
+from torchrl.envs import Transform
 from torchrl.objectives import LossModule, SoftUpdate
 
 from flowrep.agent.networks import DiscreteActions, acting_network, stochastic_policy
-from flowrep.options import AlgorithmOptions
+from flowrep.agent.observation import MapCodec
+from flowrep.agent.replay import OUTCOME, ReplayMemory
+from flowrep.options import AlgorithmOptions, OffPolicyOptions
 
 Step = Callable[[TensorDictBase], TensorDictBase]
 WARM_UP = 3  # eager updates before the graph is captured; they create Adam's moments and caches
+
+# mallopt's parameter numbers, from glibc's malloc.h.
+_M_TRIM_THRESHOLD = -1
+_M_MMAP_THRESHOLD = -3
+_THRESHOLD_BYTES = 1 << 30
 
 
 class Algorithm(ABC):
@@ -258,6 +272,89 @@ class Algorithm(ABC):
         self._capture()  # Adam's moments are at new addresses
 
 
+class OffPolicy(Algorithm):
+    """Takes one update every `frames_per_update` frames, on a uniform sample of recent frames.
+
+    Args:
+        observation_spec: the last three dims of each map are C, H, W.
+        action_spec: `Categorical` or `OneHot`.
+        keys: the observation maps to read, in order.
+        options: an instance of the class's `OPTIONS`.
+        total_frames: frames of the whole training, at whose end the learning rate is 0.
+        device: the device of networks and replay memory.
+        mirror_image: for the option `mirror`, the transform that replaces half of each sampled
+            batch by mirror images, such as `flowrep.transforms.Mirror`.
+    """
+
+    OPTIONS: ClassVar[type[AlgorithmOptions]] = OffPolicyOptions
+    options: Any
+    memory: ReplayMemory
+
+    def __init__(
+        self,
+        observation_spec: Composite,
+        action_spec: TensorSpec,
+        keys: Sequence[NestedKey],
+        options: OffPolicyOptions,
+        *,
+        total_frames: int,
+        device: torch.device | str = "cpu",
+        mirror_image: Transform | None = None,
+    ) -> None:
+        self.options = options
+        self.policy = self.make_policy(
+            observation_spec, action_spec, keys, options, total_frames=total_frames, device=device
+        )
+        network = self.policy[0].module.network
+        self.codecs = network.codecs
+        loss = self.LOSS(network, DiscreteActions.from_spec(action_spec), options)
+        starts = options.learning_starts
+        self.learning_starts = options.batch_size if starts is None else starts
+        super().__init__(
+            loss,
+            tau=options.tau,
+            learning_rate=options.learning_rate,
+            total_updates=(total_frames - self.learning_starts) // options.frames_per_update,
+        )
+        self.memory = ReplayMemory(
+            self.codecs,
+            capacity=options.replay_capacity,
+            batch_size=options.batch_size,
+            device=device,
+            n_steps=options.n_steps,
+            gamma=options.gamma,
+        )
+        if options.mirror:
+            if mirror_image is None:
+                raise ValueError("mirror=True needs mirror_image, a transform of sampled batches")
+            self.memory.append_transform(mirror_image)
+
+    def updates_due(self, frames: int) -> int:
+        """Returns how many updates are due after `frames` frames, minus those already taken."""
+        allowed = max(0, frames - self.learning_starts) // self.options.frames_per_update
+        return allowed - self.updates
+
+    def sample(self) -> TensorDictBase:
+        """Returns a sample of the replay memory."""
+        return self.memory.sample()
+
+
+def transition_keys(codecs: Sequence[MapCodec]) -> list[NestedKey]:
+    """Returns the keys of a sampled transition that a loss reads."""
+    maps = [codec.key for codec in codecs]
+    following = [unravel_key(("next", key)) for key in (*maps, *OUTCOME)]
+    return [*maps, "action", "steps_to_next_obs", *following]
+
+
+def td_target(batch: TensorDictBase, next_value: Tensor, gamma: float) -> Tensor:
+    """Returns r + γⁿ (1 - terminated) V(s') `[N]` of sampled transitions, given V(s') `[N, 1]`."""
+    outcome = batch["next"]
+    # Masked instead of multiplied, because the value after an end may be nan.
+    next_value = next_value.masked_fill(outcome["terminated"], 0.0)
+    discount = gamma ** batch["steps_to_next_obs"]
+    return (outcome["reward"] + discount * next_value).squeeze(-1)
+
+
 def weights_of(loss: LossModule) -> dict[str, Tensor]:
     """Returns a loss's parameters and target parameters by name, those of the encoders first."""
     targets = {n: w for n, w in loss.named_buffers() if n.startswith("target_") and "_params." in n}
@@ -347,3 +444,33 @@ def of_one_shape(step: Step) -> Step:
         return step(batch)
 
     return checked
+
+
+def keep_freed_memory() -> bool:
+    """Makes glibc reuse large freed blocks; returns whether that worked (False without glibc).
+
+    Call it once and early, because it doesn't affect blocks that are already allocated.
+    """
+    # By default, glibc maps every block above a threshold (32 MiB at most) and unmaps it when
+    # freed, so the kernel zeroes each activation of a large batch page by page in every update.
+    # With both thresholds at 1 GiB, the blocks stay in the heap.
+    if platform.libc_ver()[0] != "glibc":
+        return False
+    mallopt = ctypes.CDLL(None).mallopt
+    mallopt.argtypes, mallopt.restype = (ctypes.c_int, ctypes.c_int), ctypes.c_int
+    accepted = mallopt(_M_MMAP_THRESHOLD, _THRESHOLD_BYTES)
+    return bool(accepted and mallopt(_M_TRIM_THRESHOLD, _THRESHOLD_BYTES))
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Makes PyTorch use `count` threads inside the context.
+
+    The number of threads changes how sums are rounded, so only the same number gives the same bits.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

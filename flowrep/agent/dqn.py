@@ -15,8 +15,8 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.modules import EGreedyModule, QValueModule
 from torchrl.objectives import DQNLoss, ValueEstimators
 
+from flowrep.agent.algorithm import OffPolicy
 from flowrep.agent.networks import DiscreteActions, MapNetwork, PolicyNetwork
-from flowrep.agent.off_policy import OffPolicy
 from flowrep.options import DoubleDQNOptions
 
 

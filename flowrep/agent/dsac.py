@@ -12,9 +12,9 @@ from torch import Tensor
 from torchrl.objectives import DiscreteSACLoss, LossModule, ValueEstimators
 
 from flowrep.agent import networks
+from flowrep.agent.algorithm import OffPolicy, td_target, transition_keys
 from flowrep.agent.networks import DiscreteActions, Encoder, Head, MapNetwork
 from flowrep.agent.observation import decode_maps
-from flowrep.agent.off_policy import OffPolicy, td_target, transition_keys
 from flowrep.options import AlgorithmOptions, DiscreteSACOptions, SoftActorCriticOptions
 
 METRICS = {

@@ -11,10 +11,10 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictParams
 from torchrl.objectives import LossModule
 
+from flowrep.agent.algorithm import td_target, transition_keys
 from flowrep.agent.dsac import DiscreteSAC
 from flowrep.agent.networks import DiscreteActions, MapNetwork
 from flowrep.agent.observation import decode_maps
-from flowrep.agent.off_policy import td_target, transition_keys
 from flowrep.options import DiscreteSACWithValueOptions
 
 METRICS = {

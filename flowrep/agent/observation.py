@@ -24,8 +24,6 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Categorical, Composite, TensorSpec
 
-from flowrep.agent.cpu import torch_threads
-
 PRECISIONS = ("auto", "bf16", "fp32")
 MIN_SIZE = 36  # convolutions of 8/4, 4/2 and 3/1 reduce 36 pixels to one
 _FLOAT16_MAX = torch.finfo(torch.float16).max
@@ -67,10 +65,12 @@ def _bf16_products_are_faster() -> bool:
     # processors and 0.6 times on others. Both types are timed in turns and on one thread: the
     # shortest of twenty times hardly depends on what else the machine does.
     least = {torch.bfloat16: math.inf, torch.float32: math.inf}
-    with torch_threads(1):
-        for dtype in [*least] * 20:
-            x, weight = torch.ones(128, 1024, dtype=dtype), torch.ones(512, 1024, dtype=dtype)
-            least[dtype] = min(least[dtype], timeit.timeit(partial(F.linear, x, weight), number=1))
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    for dtype in [*least] * 20:
+        x, weight = torch.ones(128, 1024, dtype=dtype), torch.ones(512, 1024, dtype=dtype)
+        least[dtype] = min(least[dtype], timeit.timeit(partial(F.linear, x, weight), number=1))
+    torch.set_num_threads(threads)
     return least[torch.bfloat16] < least[torch.float32]
 
 

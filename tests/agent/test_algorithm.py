@@ -1,27 +1,25 @@
 """What holds for every algorithm of conf/algorithm/."""
 
 import math
+import platform
 from functools import partial
-from unittest.mock import patch
 
 import pytest
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDict
-from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 from torchrl.data import Categorical, OneHot
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from flowrep.agent import load_checkpoint, save_checkpoint
-from flowrep.agent.algorithm import WARM_UP, DivergenceError, DivergenceWatch, of_one_shape
+from flowrep.agent import load_checkpoint, save_checkpoint, torch_threads
+from flowrep.agent.algorithm import DivergenceError, DivergenceWatch, of_one_shape
+from tests.running import run_python
 
 ENVS = 5
 
 
 def learn(agent, random_steps, steps, frames=0):
-    """Takes in so many steps of five environments, with the updates that they bring."""
+    """Stores steps of five envs and takes the updates that are due; returns their metrics."""
     metrics = []
     for _ in range(steps):
         agent.remember(random_steps(ENVS))
@@ -43,7 +41,7 @@ def weights(agent):
     return {name: w.clone() for name, w in agent.state_dict()["weights"].items()}
 
 
-def test_an_update_moves_all_weights_and_returns_what_it_says(make_any, random_steps):
+def test_an_update_moves_all_weights_and_returns_every_metric(make_any, random_steps):
     agent = make_any()
     before = weights(agent)
     (*_, last) = learn(agent, random_steps, 12)
@@ -75,7 +73,7 @@ def test_the_learning_rate_ends_at_zero_with_the_frames(make_any, random_steps):
     assert rates[-1] == pytest.approx(2**-10 / len(rates))
 
 
-def test_off_policy_updates_are_due_after_a_first_batch_and_then_every_ten_frames(make_agent):
+def test_updates_from_replay_are_due_after_a_first_batch_and_then_every_ten_frames(make_agent):
     agent = make_agent(batch_size=16, frames_per_update=10)
     assert [agent.updates_due(frames) for frames in (0, 16, 25, 26, 66)] == [0, 0, 0, 1, 5]
     agent.updates = 2
@@ -109,7 +107,7 @@ def test_a_resumed_agent_equals_an_uninterrupted_one_bit_for_bit(make_any, rando
 
 
 @pytest.mark.slow_after_first
-def test_an_agent_that_diverged_keeps_its_weights_and_can_begin_anew(make_any, random_steps):
+def test_an_agent_that_diverged_keeps_its_weights_until_a_state_is_loaded(make_any, random_steps):
     used, new = make_any(learning_rate=0.01), make_any(learning_rate=0.01)
     for _ in range(12):
         used.remember(random_steps(ENVS))
@@ -137,7 +135,7 @@ def test_an_agent_that_diverged_keeps_its_weights_and_can_begin_anew(make_any, r
 
 
 @pytest.mark.slow_after_first
-def test_one_hot_actions_teach_what_categorical_ones_do(make_any, random_steps):
+def test_one_hot_actions_train_the_same_weights_as_categorical_ones(make_any, random_steps):
     agents = plain, one_hot = make_any(), make_any(action_spec=OneHot(3))
     for _ in range(8):
         steps = random_steps(ENVS)
@@ -151,14 +149,14 @@ def test_one_hot_actions_teach_what_categorical_ones_do(make_any, random_steps):
         torch.testing.assert_close(one_hot.weights[name], weight)
 
 
-def test_a_state_of_other_maps_is_refused_by_name(make_agent):
+def test_a_state_of_other_maps_is_refused_with_a_weight_that_differs(make_agent):
     saved = make_agent(keys=["flow"]).state_dict()
     with pytest.raises(ValueError, match=r"does not fit this one in \d+ weights, first .* here, "):
         make_agent(keys=["flow", "seg"]).load_state_dict(saved)
 
 
 @pytest.mark.slow_after_first
-def test_a_policy_is_built_and_loaded_without_its_learner(
+def test_a_policy_is_built_and_loaded_without_the_rest_of_the_agent(
     make_any, observation_spec, random_steps, random_maps, tmp_path
 ):
     """Of one environment, too, where a rollout would be less than a batch of PPO's."""
@@ -186,7 +184,7 @@ def test_a_policy_is_built_and_loaded_without_its_learner(
     torch.testing.assert_close(shares, expected[0], atol=0.05, rtol=0)
 
 
-def test_the_first_bad_update_is_counted_and_told_with_its_metrics():
+def test_the_error_names_the_first_update_that_diverged_and_its_metrics():
     watch = DivergenceWatch(["q_loss", "actor_loss"], ["entropy"])
     is_bad, nan = watch.is_bad, math.nan  # the optimizer holds the tensor
     # what is logged beside the losses may be undefined
@@ -205,137 +203,7 @@ def test_the_first_bad_update_is_counted_and_told_with_its_metrics():
         assert is_bad == 0
 
 
-BATCHES = 7
-
-
-def batches_of(agents, random_steps):
-    """Samples for several updates, drawn before the first one; all agents see the same steps."""
-    for _ in range(12):
-        step = random_steps(ENVS).to(agents[0].device)
-        for agent in agents:
-            agent.remember(step)
-    return [agents[0].sample() for _ in range(BATCHES)]
-
-
-def state_of(agent):
-    """All that an update changes, by name."""
-    moments = {
-        f"{name}/{key}": value
-        for name, weight in agent.trained.items()
-        for key, value in agent.optimizer.state[weight].items()
-    }
-    return agent.weights | moments
-
-
-class Taped(TorchDispatchMode):
-    """Does what a CUDA graph does, on a CPU: takes the kernels of one step again and again.
-
-    Without any Python between, and on the same memory. The first steps are taken as they are.
-    """
-
-    def __init__(self, step):
-        super().__init__()
-        self.step, self.steps, self.calls = step, 0, []
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        out = func(*args, **(kwargs or {}))
-        if not func.is_view:  # a view of memory that is written again needs no second look
-            self.calls.append((func, args, kwargs or {}, out))
-        return out
-
-    @torch.no_grad()
-    def replay(self):
-        for func, args, kwargs, out in self.calls:
-            again = func(*args, **kwargs)
-            for old, new in zip(tree_leaves(out), tree_leaves(again), strict=True):
-                if isinstance(old, Tensor) and old is not new:
-                    old.copy_(new)
-
-    def __call__(self, batch):
-        self.steps += 1
-        if self.steps < WARM_UP:
-            return self.step(batch)
-        if self.steps == WARM_UP:
-            static = batch.clone()
-            self.inputs = static.copy()
-            with self:
-                self.out = self.step(static)
-        else:
-            self.inputs.update_(batch)
-            self.replay()
-        return self.out.clone()
-
-
-@pytest.mark.slow_after_first
-def test_an_update_from_the_tape_is_the_update(make_any, random_steps):
-    """A bad batch, too: it stops the weights."""
-    eager = make_any(learning_rate=0.01)
-    with patch("flowrep.agent.algorithm.as_cuda_graph", lambda step, device: Taped(step)):
-        taped = make_any(learning_rate=0.01)
-    batches = batches_of([eager, taped], random_steps)
-    for batch in (*batches[:-1], spoilt(batches[-2]), batches[-1]):
-        expected, actual = eager.update(batch.clone()), taped.update(batch.clone())
-        assert expected.keys() == actual.keys()
-        differing = [n for n in expected if not torch.equal(expected[n], actual[n])]
-        assert [n for n in differing if not expected[n].isnan()] == []
-    expected, actual = state_of(eager), state_of(taped)
-    assert [n for n in expected if not torch.equal(expected[n], actual[n])] == []
-    for agent in (eager, taped):
-        with pytest.raises(DivergenceError, match=f"in update {BATCHES} "):
-            agent.divergence.check()
-
-
-class Foreign(TorchDispatchMode):
-    """Notes what passes between the CPU and another device, for which "meta" stands in."""
-
-    def __init__(self):
-        super().__init__()
-        self.crossings = []
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        out = func(*args, **(kwargs or {}))
-        tensors = [x for x in tree_leaves((args, kwargs, out)) if isinstance(x, Tensor)]
-        if {x.device.type for x in tensors} > {"meta"}:
-            self.crossings.append(str(func))
-        return out
-
-
-def on_a_device_that_cannot_be_read(make_any):
-    """An agent on "meta", which has shapes and no numbers, as good as a GPU that must not wait."""
-    reads = {"item": lambda _: 0.5, "is_set_to": lambda *_: False, "__bool__": lambda _: True}
-    with patch.multiple(Tensor, **reads):  # TorchRL looks into the weights when it is set up
-        return make_any(device="meta")
-
-
-def take_losses(agent, batch):
-    losses = agent.losses(batch)
-    torch.stack([x for name, x in losses.items() if name.endswith("_loss")]).sum().backward()
-    agent.divergence.record(losses | {"grad_norm": agent._gradient_norm()})
-    agent.after_update()
-
-
-def test_an_update_asks_the_device_for_no_number_and_brings_it_none(make_any, random_steps):
-    batch = batches_of([make_any()], random_steps)[0].to("meta")
-    agent = on_a_device_that_cannot_be_read(make_any)
-    assert agent.CAPTURABLE
-    take_losses(agent, batch.copy())  # TorchRL brings its discount when it is first used
-    with Foreign() as foreign:
-        take_losses(agent, batch.copy())
-    assert foreign.crossings == []
-
-
-def test_an_algorithm_can_be_told_to_leave_graphs_alone(make_agent):
-    with patch("flowrep.agent.algorithm.as_cuda_graph") as capture:
-        agent = make_agent()
-        assert capture.call_count == 1
-        agent.load_state_dict(agent.state_dict())
-        assert capture.call_count == 2
-        agent.step_eagerly()
-        agent.load_state_dict(agent.state_dict())
-        assert capture.call_count == 2
-
-
-def test_a_batch_unlike_the_first_is_refused_by_name():
+def test_a_batch_of_another_layout_is_refused_with_the_key_that_differs():
     step = of_one_shape(lambda batch: batch)
     first = TensorDict({"seen": torch.zeros(4, 2), "next": {"reward": torch.zeros(4, 1)}}, [4])
     assert step(first) is first
@@ -350,8 +218,12 @@ def test_a_batch_unlike_the_first_is_refused_by_name():
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_a_graph_on_cuda_equals_the_steps_it_replaces_and_resumes(make_any, random_steps):
-    eager, graph, resumed = (make_any(device="cuda", seed=seed) for seed in (0, 0, 9))
-    batches = batches_of([eager, graph, resumed], random_steps)
+    eager, graph, resumed = agents = [make_any(device="cuda", seed=seed) for seed in (0, 0, 9)]
+    for _ in range(12):
+        step = random_steps(ENVS).to("cuda")
+        for agent in agents:
+            agent.remember(step)
+    batches = [eager.sample() for _ in range(7)]
     eager.step_eagerly()
     for batch in batches[:5]:
         resumed.update(batch.clone())
@@ -363,6 +235,40 @@ def test_a_graph_on_cuda_equals_the_steps_it_replaces_and_resumes(make_any, rand
             metrics = agent.update(batch.clone())
             for name, value in expected.items():
                 close(metrics[name], value)
-    for name, value in state_of(eager).items():
-        close(state_of(graph)[name], value)
-        close(state_of(resumed)[name], value)
+    for agent in (graph, resumed):
+        for name, weight in eager.weights.items():
+            close(agent.weights[name], weight)
+        for name, weight in eager.trained.items():
+            moments = agent.optimizer.state[agent.trained[name]]
+            for key, value in eager.optimizer.state[weight].items():
+                close(moments[key], value)
+
+
+COUNT_PAGE_FAULTS = """
+import resource
+from flowrep.agent import keep_freed_memory
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(5):
+        bytearray(b"x") * 80_000_000  # some 20,000 pages
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+by_default = faults()
+assert keep_freed_memory()
+faults()
+print(by_default, faults())
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc's allocator")
+def test_a_freed_block_is_reused_without_page_faults():
+    result = run_python("-c", COUNT_PAGE_FAULTS, check=True)
+    by_default, kept = map(int, result.stdout.split())
+    assert kept < 0.1 * by_default
+
+
+def test_the_number_of_threads_is_set_inside_and_restored_afterwards():
+    before = torch.get_num_threads()
+    with torch_threads(before + 1):
+        assert torch.get_num_threads() == before + 1
+    assert torch.get_num_threads() == before

@@ -40,9 +40,3 @@ def test_the_online_network_chooses_and_the_target_network_values(
     losses = agent.losses(batch.clone())
     torch.testing.assert_close(losses["q_loss"].detach(), (error**2).mean())
     torch.testing.assert_close(losses["td_error"], error.abs().mean())
-
-
-def test_one_policy_acts_for_any_number_of_envs(make_agent, random_steps):
-    policy = make_agent(DoubleDQN).policy
-    for count in (1, 3, 8):
-        assert policy(random_steps(count))["action"].shape == (count,)

@@ -6,13 +6,13 @@ import pytest
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDict
-from torchrl.data import Binary, Composite, Unbounded
+from torchrl.data import Composite, Unbounded
 
 from flowrep.agent import DiscreteSAC, DiscreteSACWithValue
 from tests.agent.plain import encode, head
 
 
-def test_bfloat16_stays_near_float32(make_agent, random_steps, as_batch):
+def test_losses_in_bfloat16_are_near_those_in_float32(make_agent, random_steps, as_batch):
     steps = random_steps(64)
     losses = {}
     for precision in ("fp32", "bf16"):
@@ -24,15 +24,8 @@ def test_bfloat16_stays_near_float32(make_agent, random_steps, as_batch):
         )
 
 
-def test_settings_that_do_not_exist_are_refused(make_agent):
-    with pytest.raises(ValueError, match="encoder"):
-        make_agent(encoder="both")
-    with pytest.raises(TypeError, match="Binary"):
-        make_agent(action_spec=Binary(3))
-
-
 @pytest.mark.slow
-def test_learns_to_walk_to_the_end_of_a_corridor(make_agent, as_batch):
+def test_dsac_learns_to_walk_to_the_end_of_a_corridor(make_agent, as_batch):
     """Action 2 goes right, 1 left, 0 stays; reaching the last of five cells is worth 1."""
     spec = Composite(view=Unbounded((1, 36, 40)))
     # in cell c, columns 8 c to 8 c + 7 are bright
@@ -123,7 +116,7 @@ def dsac_v_losses(weights, maps, next_maps, action, reward, terminated):
         (DiscreteSACWithValue, {}, dsac_v_losses),
     ],
 )
-def test_three_updates_equal_the_plain_float64_ones(
+def test_three_updates_equal_those_of_the_losses_in_plain_float64(
     make_agent, random_steps, as_batch, algorithm, options, reference_losses
 ):
     """Steps that are done without being terminated count like others, as the reference has it."""

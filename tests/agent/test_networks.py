@@ -1,12 +1,12 @@
 import pytest
 import torch
-from torchrl.data import Composite, Unbounded
+from torchrl.data import Binary, Composite, Unbounded
 
 from flowrep.agent.networks import Encoder
 from flowrep.agent.observation import map_codecs
 
 
-def test_a_normalised_embedding_has_mean_0_and_variance_1_whatever_the_scale_of_its_map():
+def test_a_normalised_embedding_has_mean_0_and_variance_1_at_any_scale_of_its_map():
     torch.manual_seed(3)
     spec = Composite(large=Unbounded((2, 40, 44)), small=Unbounded((1, 40, 44)))
     two = map_codecs(spec, ["large", "small"], torch.float32)
@@ -25,12 +25,17 @@ def probabilities(agent, maps):
 
 
 @pytest.mark.parametrize("batch", [(), (3,), (2, 1)])
-def test_any_batch_acts_like_a_loop_and_adds_only_the_action(make_agent, random_maps, batch):
-    agent, maps = make_agent(), random_maps(*batch)
+def test_a_batch_acts_like_a_loop_over_it_and_writes_only_the_action(make_any, random_maps, batch):
+    agent, maps = make_any(), random_maps(*batch)
     probs = probabilities(agent, maps)
     assert probs.shape == (*batch, 3)
     looped = [probabilities(agent, one) for one in (maps.reshape(-1) if batch else [maps])]
     torch.testing.assert_close(probs.reshape(-1, 3), torch.stack(looped))
     acted = agent.policy(maps.clone())
     assert acted["action"].shape == batch
-    assert set(acted.keys()) - set(maps.keys()) == {"action"}
+    assert set(acted.keys()) - set(maps.keys()) - {"action_log_prob"} == {"action"}
+
+
+def test_an_action_of_several_choices_is_refused(make_agent):
+    with pytest.raises(TypeError, match="Binary"):
+        make_agent(action_spec=Binary(3))

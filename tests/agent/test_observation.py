@@ -8,7 +8,7 @@ from flowrep.agent import observation
 from flowrep.agent.observation import compute_dtype, map_codecs
 
 
-def test_auto_takes_bfloat16_where_it_is_fast(monkeypatch):
+def test_precision_auto_is_bfloat16_where_that_is_faster(monkeypatch):
     cpu = torch.device("cpu")
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True})
     for faster, dtype in ((True, torch.bfloat16), (False, torch.float32)):
@@ -30,7 +30,7 @@ def codec(spec, key="map", dtype=torch.float32):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 @pytest.mark.parametrize("batch", [(3,), (2, 1)])
-def test_what_is_stored_and_what_the_network_sees(dtype, batch):
+def test_floats_are_stored_in_two_bytes_and_intensities_seen_as_shares_of_255(dtype, batch):
     flow, rgb = torch.randn(*batch, 2, 38, 45), torch.randint(256, (*batch, 3, 38, 45)).byte()
     c = codec(Unbounded((2, 38, 45)), dtype=dtype)
     stored = c.store(flow)
@@ -46,7 +46,7 @@ def test_what_is_stored_and_what_the_network_sees(dtype, batch):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_class_ids_become_one_hot_frame_by_frame_and_no_class_all_zeros(dtype):
+def test_class_ids_become_one_hot_frame_by_frame_and_unknown_ids_zeros(dtype):
     c = codec(Categorical(4, (2, 38, 45), dtype=torch.int64), dtype=dtype)
     ids = torch.randint(4, (3, 2, 38, 45))
     ids[1, 1, 6, 9], ids[2, 0, 30, 3] = 255, 4
@@ -82,12 +82,12 @@ def test_a_map_of_another_size_is_not_stored(shape):
         (Categorical(300, (1, 40, 40)), "300 classes"),
     ],
 )
-def test_a_spec_that_cannot_be_read_says_why(spec, message):
+def test_a_spec_that_no_codec_fits_is_refused_with_the_reason(spec, message):
     with pytest.raises(ValueError, match=message):
         map_codecs(Composite(map=spec), ["map"], torch.float32)
 
 
-def test_keys_may_be_nested_and_a_missing_one_lists_what_there_is():
+def test_keys_may_be_nested_and_a_missing_key_is_refused_with_those_there_are():
     spec = Composite(view=Composite(ego=Unbounded((2, 40, 40))))
     assert map_codecs(spec, [("view", "ego")], torch.float32)[0].channels == 2
     with pytest.raises(KeyError, match=r"reads 'obj'; the environment offers .*'ego'"):

@@ -47,7 +47,7 @@ def worth(agent, number):
         return agent.loss.critic_network(embedded)["state_value"]
 
 
-def test_a_round_is_due_when_the_rollout_is_complete_and_no_frame_is_learnt_from_twice():
+def test_a_complete_rollout_is_learnt_from_in_shuffled_passes_and_then_forgotten():
     agent = make_ppo()
     for t, each in enumerate(STEPS):
         assert agent.updates_due(ENVS * t) == 0
@@ -55,20 +55,22 @@ def test_a_round_is_due_when_the_rollout_is_complete_and_no_frame_is_learnt_from
     # 8 frames make 2 batches of 3, in each of 3 epochs
     assert agent.updates_due(8) == 6
     seen = [agent.sample()["next", "reward"].flatten().tolist() for _ in range(6)]
-    for first, second in zip(seen[::2], seen[1::2]):
-        assert len({*first, *second}) == 6
+    passes = [(*first, *second) for first, second in zip(seen[::2], seen[1::2])]
+    assert [len({*rewards}) for rewards in passes] == [6, 6, 6]
+    assert len({*passes}) == 3  # shuffled: in the order of time, all three would be equal
     assert len(agent.memory) == 0
     assert agent.updates_due(8) == 0
     assert agent.total_updates == 600 // 8 * 6
 
 
-def test_advantages_by_hand():
+def test_advantages_are_those_worked_by_hand():
     """Environment 0 terminates in its second step, environment 1 is cut off in its third."""
-    agent = make_ppo()
+    agent = make_ppo(batch_size=8, epochs=1)
     for each in STEPS:
         agent.remember(each)
     agent.weights["critic_network_params.module.output.weight"].data.mul_(10)
-    steps = agent._with_advantages(agent.memory.steps())
+    batch = agent.sample()
+    steps = batch[batch["next", "reward"].flatten().argsort()]  # rewards count the steps from 1 on
     v = {
         n: worth(agent, n).item()
         for n in (0.125, 0.25, 0.75, 0.875, 4.0, 1.0, 1.125, 1.25, 1.5, 2.0, 3.0)
@@ -82,14 +84,14 @@ def test_advantages_by_hand():
     b1 = 4 + 0.5 * v[1.25] - v[1.125] + 0.375 * b2
     b0 = 2 + 0.5 * v[1.125] - v[1.0] + 0.375 * b1
     b3 = 8 + 0.5 * v[3.0] - v[2.0]
-    expected = torch.tensor([[a0, a1, a2, a3], [b0, b1, b2, b3]])
+    expected = torch.tensor([a0, b0, a1, b1, a2, b2, a3, b3])
     advantage = steps["advantage"].squeeze(-1)
     torch.testing.assert_close(advantage, expected)
     target = advantage + steps["state_value"].squeeze(-1)
     torch.testing.assert_close(steps["value_target"].squeeze(-1), target)
 
 
-def test_steps_that_earlier_weights_took_count_by_how_likely_they_then_were():
+def test_a_step_is_weighted_by_how_likely_it_was_under_the_weights_that_acted():
     """The training loop begins the next rollout before it learns from the last one."""
     agent = make_ppo(gamma=0.0, clip=0.9, batch_size=8, epochs=1)
     for each in STEPS:
@@ -121,6 +123,6 @@ def test_gradients_are_scaled_down_to_the_largest_norm():
     assert gradients.norm().item() == pytest.approx(1e-3, rel=1e-3)
 
 
-def test_a_batch_that_no_rollout_fills_is_refused():
+def test_a_batch_larger_than_a_rollout_is_refused():
     with pytest.raises(ValueError, match=r"batch_size=9 is more than the 8 frames of a rollout"):
         make_ppo(batch_size=9)

@@ -89,14 +89,14 @@ def transitions(replay):
         ),
     ],
 )
-def test_next_is_the_frame_that_followed_in_the_same_episode(steps, expected):
+def test_the_next_observation_is_that_of_the_next_step_of_the_episode(steps, expected):
     replay = memory()
     for each in steps:
         replay.extend(each)
     assert transitions(replay) == expected
 
 
-def test_an_episode_that_begins_with_what_the_last_one_ended_with_is_not_joined_to_it():
+def test_two_episodes_are_not_joined_even_if_their_maps_are_equal():
     replay = memory(n_steps=3)
     # object flow where nothing moves, or where nothing is known: every map is the same
     zero, nan = [0, 0], [float("nan")] * 2
@@ -144,7 +144,7 @@ def test_steps_may_come_one_by_one_or_in_a_batch_with_its_time_last_or_named():
     assert transitions(trajectory) == transitions(single) == expected
 
 
-def test_the_oldest_are_overwritten():
+def test_a_full_memory_overwrites_its_oldest_rows():
     replay = memory(capacity=7)  # not a multiple of the two environments
     for i in range(9):
         replay.extend(step([i, 100 + i], [i + 1, 101 + i]))
@@ -193,7 +193,7 @@ def test_sampling_is_uniform_with_replacement():
     assert ((counts - 800).abs() < 101).all()
 
 
-def test_maps_are_kept_once_and_in_two_bytes_a_number():
+def test_each_map_is_stored_once_and_takes_two_bytes_a_number():
     replay = memory(capacity=50)
     for i in range(30):
         replay.extend(step([i, 50 + i], [i + 1, 51 + i]))
@@ -202,7 +202,7 @@ def test_maps_are_kept_once_and_in_two_bytes_a_number():
     assert [t.nbytes for t in maps] == [50 * 36 * 36 * 2]
 
 
-def test_what_does_not_fit_is_refused_with_the_size_that_does():
+def test_a_capacity_that_is_too_small_is_refused_with_the_least_that_fits():
     with pytest.raises(ValueError, match="n_steps is 0"):
         memory(n_steps=0)
     with pytest.raises(ValueError, match=r"capacity of 5 .* one|hold 6"):
@@ -223,7 +223,7 @@ def by_folder(first, second, folder):
 
 @pytest.mark.parametrize("move", [by_state, by_folder])
 @pytest.mark.parametrize("used", [0, 9])
-def test_a_restored_memory_goes_on_as_the_saved_one(tmp_path, move, used):
+def test_a_restored_memory_draws_what_the_saved_one_draws(tmp_path, move, used):
     first, second = memory(capacity=11), memory(capacity=11)
     for i in range(8):  # more rows than it holds
         first.extend(step([i, 100 + i], [i + 1, 101 + i]))
@@ -248,7 +248,7 @@ def test_an_empty_memory_is_restored_and_one_of_another_capacity_refused():
         memory(capacity=12).load_state_dict(replay.state_dict())
 
 
-def test_an_agent_that_mirrors_learns_from_what_was_seen_and_from_its_image(
+def test_an_agent_that_mirrors_learns_from_observations_and_from_their_mirror_images(
     make_agent, random_steps
 ):
     mirror = Mirror(["flow", "seg"], flow_keys="flow", swapped_actions=[0, 2, 1])
