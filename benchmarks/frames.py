@@ -24,8 +24,8 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from flowrep.baselines import Planner
 from flowrep.envs import StreetEnv, make_env
-from flowrep.envs.episode import Episode
 from flowrep.envs.sensing import Sensing
+from flowrep.envs.street_env import Episode
 from flowrep.envs.vector_env import StreetVectorEnv
 from flowrep.scenes import load_scene, scene_names
 from flowrep.scenes.scene import Scene

@@ -27,7 +27,7 @@ from flowrep.agent import keep_freed_memory
 from flowrep.agent.networks import DiscreteActions, acting_network, stochastic_policy
 from flowrep.agent.observation import store_maps
 from flowrep.envs import StreetEnv, make_env, make_mirror
-from flowrep.envs.episode import Episode, reward
+from flowrep.envs.street_env import Episode, reward
 from flowrep.envs.torchrl_env import street_envs
 from flowrep.experiment.evaluation import evaluate
 from flowrep.scenes import Scene, load_scene

@@ -16,8 +16,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from flowrep.envs.episode import Episode
-from flowrep.envs.street_env import StreetEnv
+from flowrep.envs.street_env import Episode, StreetEnv
 from flowrep.scenes.layout import Layout, free_ground
 from flowrep.scenes.pedestrians import RADIUS_M as PERSON_RADIUS_M
 from flowrep.scenes.pedestrians import Crowd

@@ -15,8 +15,7 @@ require("flowrep.envs", "sim", "pybullet", "gymnasium", "shapely", "yaml", "numb
 
 import gymnasium
 
-from flowrep.envs.episode import Outcome
-from flowrep.envs.street_env import StreetEnv
+from flowrep.envs.street_env import Outcome, StreetEnv
 from flowrep.envs.workers import WorkerError, WorkerVectorEnv
 
 if TYPE_CHECKING:

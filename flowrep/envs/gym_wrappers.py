@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
-from flowrep.envs.episode import Outcome
-from flowrep.envs.street_env import StreetEnv
+from flowrep.envs.street_env import Outcome, StreetEnv
 from flowrep.envs.torchrl_env import sensors_read
 from flowrep.scenes.scene import Scene
 from flowrep.transforms import representation_stack

@@ -1,14 +1,13 @@
 """What a street's camera observes: maps, and motions of camera and bodies since the last step."""
 
 from collections.abc import Sequence, Set
-from typing import Any
+from typing import Any, TypeAlias
 from weakref import WeakValueDictionary
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from flowrep.envs.episode import EPISODE_SEEDS, Episode, Moment
 from flowrep.scenes.pedestrians import PARTS, world_from_parts
 from flowrep.scenes.scene import num_classes
 from flowrep.simulator import camera
@@ -17,9 +16,12 @@ from flowrep.simulator.motion import instance_motion, planar, relative_motion, r
 from flowrep.simulator.paint import SKY
 from flowrep.simulator.street import Street
 
+Episode: TypeAlias = Any  # this and `Moment` are street_env's, which imports this module
+Moment: TypeAlias = Any
 Array = NDArray[Any]
 Arrays = dict[str, Array]
 SENSORS = ("depth", "semantic", "instance", "prev_from_curr", "instance_motion", "rgb", "frame")
+EPISODE_SEEDS = 1 << 62  # seeds are smaller; a space of all numbers of int64 can't be sampled
 _MAPS = frozenset({"depth", "semantic", "instance"})
 _DRAWN = _MAPS | {"rgb"}
 

@@ -1,20 +1,196 @@
-"""The gymnasium env of a street."""
+"""The gymnasium env of a street: what a step does, when an episode ends, its reward."""
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
+import numpy as np
+import shapely
 from gymnasium import spaces
+from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
 
 from flowrep.choices import FRAME_RATES_HZ, SpeedMode
-from flowrep.envs.episode import EPISODE_SEEDS, Episode, Moment, Outcome, reward
-from flowrep.envs.sensing import SENSORS, Sensing
+from flowrep.envs.sensing import EPISODE_SEEDS, SENSORS, Sensing
+from flowrep.scenes.layout import Layout
 from flowrep.scenes.load import load_scene
-from flowrep.scenes.scene import Range, Scene, num_classes
-from flowrep.scenes.vehicle import YAW_SIGN, VehicleState
+from flowrep.scenes.pedestrians import Crowd, draw_crowd
+from flowrep.scenes.scene import CATEGORIES, CATEGORY_ID, Part, Range, Scene, num_classes
+from flowrep.scenes.vehicle import YAW_SIGN, VehicleState, footprint_corners, roll, turn
 from flowrep.simulator.street import Street
+
+Array = NDArray[Any]
+
+
+class Outcome(IntEnum):
+    """The state of an episode; the TensorDict holds its code."""
+
+    RUNNING = 0
+    SUCCESS = 1
+    COLLISION = 2
+    OUT_OF_BOUNDS = 3
+    TIMEOUT = 4
+
+    @property
+    def label(self) -> str:
+        """Its name in `info`, tables and files."""
+        return self.name.lower()
+
+
+NOTHING_HIT = 255  # value of `hit` without a collision; no class has this id
+
+
+def reward(outcome: Outcome) -> float:
+    """Returns the reward of a step that leads to `outcome`."""
+    return 0.01 + {Outcome.RUNNING: 0.0, Outcome.SUCCESS: 5.0}.get(outcome, -5.0)
+
+
+def hit_name(code: int) -> str:
+    """Returns the category of a code of `hit`, or "" for nothing."""
+    return "" if code == NOTHING_HIT else CATEGORIES[code]
+
+
+# Between two tests of the footprint, neither the vehicle nor a person moves more than 0.42 m (the
+# vehicle at 10 m/s), and a shorter vehicle not more than its length. So it can't jump over
+# anything.
+_CHECKS_HZ = 24.0
+_CHECKS_PER_M = 2.4
+_STEPS_AHEAD = 16  # people ignore the vehicle, so their poses are computed for many steps at once
+
+
+class Moment(NamedTuple):
+    """The vehicle's state and the pedestrians' clock in ticks; each tick tests the footprint."""
+
+    vehicle: VehicleState
+    ticks: int
+
+
+def ticks_for(scene: Scene, frame_rate_hz: float, speed_mps: Range, driven_mps: float) -> int:
+    """Returns how many times a step tests the footprint, at the speeds of an episode."""
+    groups = [group for group in scene.pedestrian_groups if group.standing < group.count]
+    fastest_mps = max(((group.speed_mps or speed_mps)[1] for group in groups), default=0.0)
+    # Nothing that a camera sees twice has moved farther than it sees.
+    most_mps = scene.camera.far_m * frame_rate_hz
+    for key, mps in (("speed", fastest_mps), ("vehicle_speed_mps", driven_mps)):
+        if mps > most_mps:
+            raise ValueError(
+                f"{key} is {mps:g} m/s, {mps / frame_rate_hz:g} m in a step, but the camera sees "
+                f"{scene.camera.far_m:g} m; give {most_mps:g} m/s or less"
+            )
+    driven_hz = driven_mps * max(_CHECKS_PER_M, 1.0 / scene.vehicle.length_m)
+    checks_hz = max(_CHECKS_HZ, driven_hz, fastest_mps * _CHECKS_PER_M)
+    return math.ceil(checks_hz / frame_rate_hz - 1e-9)
+
+
+class Episode:
+    """One drive through a scene: positions, outcome and reward, without rendering.
+
+    It is a function of the scene, the speed range, the frame rate, its seed and the actions.
+
+    Args:
+        layout: the ground plan of the scene.
+        frame_rate_hz: steps a second.
+        episode_seed: seed of everything that is drawn: the path, and how people walk.
+        speed_mps: lowest and highest speed of people whose group doesn't set its speed.
+        vehicle_speed_mps: the speed at which the vehicle drives.
+        path: the name of the path; None draws one.
+
+    Raises:
+        ValueError: the scene has no such path.
+    """
+
+    def __init__(
+        self,
+        layout: Layout,
+        frame_rate_hz: float,
+        episode_seed: int,
+        speed_mps: Range,
+        vehicle_speed_mps: float,
+        path: str | None = None,
+    ) -> None:
+        scene = layout.scene
+        paths = {each.name: each for each in scene.paths}
+        if path not in (None, *paths):
+            raise ValueError(f"unknown path {path!r}; the scene has {[*paths]}")
+        # A seed's episode depends on the order of the draws: first the path, then the people.
+        rng = np.random.default_rng(episode_seed)
+        # Draw even if a path is given, so that a seed has the same people on every path.
+        drawn = scene.paths[int(rng.integers(len(scene.paths)))]
+        self.layout, self.seed = layout, episode_seed
+        self.speed_mps, self.vehicle_speed_mps = speed_mps, vehicle_speed_mps
+        self.frame_rate_hz, self.dt_s = frame_rate_hz, 1.0 / frame_rate_hz
+        self.ticks_per_step = ticks_for(scene, frame_rate_hz, speed_mps, vehicle_speed_mps)
+        self.tick_s = self.dt_s / self.ticks_per_step
+        # Rounding must not add a step: 200 / 12 · 15 is 250.00000000000003.
+        self.limit_steps = math.ceil(scene.time_limit_s * frame_rate_hz - 1e-9)
+        self.path = drawn if path is None else paths[path]
+        self.crowd: Crowd = draw_crowd(layout, speed_mps, rng)
+        self.goal = layout.zones[self.path.end]
+        self.now = self.before = Moment(layout.start_state(self.path.start), 0)
+        self.steps, self.outcome, self.hit = 0, Outcome.RUNNING, ""
+        self.poses = self.poses_before = self.crowd.poses(0.0)
+        # Poses of people at consecutive ticks, [ticks, P, 4], and the first of these ticks.
+        self._ahead_from, self._ahead = 0, self.poses[:0, None]
+
+    def status(self) -> dict[str, int]:
+        """Returns outcome, hit, seed and path as numbers, for TensorDicts."""
+        return {
+            "outcome": int(self.outcome),
+            "hit": CATEGORY_ID[self.hit] if self.hit else NOTHING_HIT,
+            "episode_seed": self.seed,
+            "path": self.layout.scene.paths.index(self.path),
+        }
+
+    def resume(self, before: Moment, now: Moment) -> None:
+        """Jumps to a later step, given its moment and the one before it."""
+        self.before, self.now = before, now
+        self.poses_before = self.crowd.poses(before.ticks * self.tick_s)
+        self.poses = self.crowd.poses(now.ticks * self.tick_s)
+
+    def step(self, action: int, street: Street) -> None:
+        """Drives one step, or part of it if the episode ends."""
+        # The yaw rate changes once, at the beginning. Then the vehicle drives along an arc, on
+        # which the footprint is tested at every tick.
+        turned = turn(self.now.vehicle, YAW_SIGN[action], self.dt_s, self.layout.scene.vehicle)
+        times_s = [(1 + i) * self.tick_s for i in range(self.ticks_per_step)]
+        track = [roll(turned, time_s, self.vehicle_speed_mps) for time_s in times_s]
+        poses = self._poses_ahead()
+        is_near = street.is_anyone_near(track, poses).tolist()
+        for i, vehicle in enumerate(track):
+            # Call PyBullet and shapely only where a collision or an end is possible.
+            if is_near[i] or not street.is_safe(vehicle.x_m, vehicle.y_m):
+                self._end_where_due(vehicle, poses[i], street)
+            if self.outcome:
+                break
+        self.before, self.now = self.now, Moment(vehicle, self.now.ticks + i + 1)
+        self.poses_before, self.poses = self.poses, poses[i]
+        self.steps += 1
+        if not self.outcome and self.steps >= self.limit_steps:
+            self.outcome = Outcome.TIMEOUT
+
+    def _poses_ahead(self) -> Array:  # at the checks of the next step, [T, P, 4]
+        count, first = self.ticks_per_step, self.now.ticks + 1
+        at = first - self._ahead_from
+        if not 0 <= at <= len(self._ahead) - count:
+            ticks = first + np.arange(count * _STEPS_AHEAD)
+            self._ahead = self.crowd.poses(ticks[:, None] * self.tick_s)
+            self._ahead_from, at = first, 0
+        return self._ahead[at : at + count]
+
+    def _end_where_due(self, vehicle: VehicleState, poses: Array, street: Street) -> None:
+        self.hit = street.hit(vehicle, poses, self.path.closures)
+        footprint = shapely.Polygon(footprint_corners(vehicle, self.layout.scene.vehicle))
+        if self.hit:
+            self.outcome = Outcome.COLLISION
+        elif not self.layout.drivable.covers(footprint):
+            self.outcome = Outcome.OUT_OF_BOUNDS
+        elif shapely.contains_xy(self.goal, vehicle.x_m, vehicle.y_m):
+            self.outcome = Outcome.SUCCESS
+
 
 _OPTIONS = ("episode_seed", "path", "vehicle_speed_mps", "speed", "frame_rate_hz")
 
@@ -55,6 +231,8 @@ class StreetEnv(gym.Env):
         ValueError: another argument is invalid.
     """
 
+    sensing: Sensing
+    _street: Street
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 12}  # noqa: RUF012
 
     def __init__(
@@ -78,10 +256,11 @@ class StreetEnv(gym.Env):
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self.frame_rate_hz}
         self.num_classes = num_classes(self.scene.categories)
-        self._street = Street.shared(self.scene)
-        self.sensing = Sensing.shared(self._street, sensors, renderer, picture_scale)
-        self.K = self.sensing.K
+        ticks_for(self.scene, self.frame_rate_hz, self.speed_mps, self.scene.vehicle.speed_mps)
+        self._camera = sensors, renderer, picture_scale
         self._episode: Episode | None = None
+        self._open()
+        self.K = self.sensing.K
         self.action_space = spaces.Discrete(len(YAW_SIGN))
         self.observation_space = self.sensing.space()
 
@@ -113,14 +292,13 @@ class StreetEnv(gym.Env):
     def begin(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
         """Begins an episode like `reset`, without an observation."""
         super().reset(seed=seed)
+        if self._street is None:  # closed
+            self._open()
         options = options or {}
         if "state" in options:
             if others := sorted(options.keys() - {"state"}):
                 raise ValueError(f"reset options {others} can't be combined with state")
-            try:
-                self._resume(options["state"])
-            except (KeyError, TypeError) as error:
-                raise ValueError(f"this is not a state returned by get_state: {error!r}") from error
+            self._resume(_checked_state(options["state"]))
         else:
             self._begin({"episode_seed": int(self.np_random.integers(1 << 31))} | options)
 
@@ -144,11 +322,19 @@ class StreetEnv(gym.Env):
 
     def render(self) -> Any:
         """Returns the camera's picture, [H, W, 3] uint8, if the render mode is "rgb_array"."""
-        return None if self.render_mode is None else self.sensing.rgb(self.episode)
+        episode = self.episode
+        return None if self.render_mode is None else self.sensing.rgb(episode)
 
     def close(self) -> None:
-        """Releases the street; its simulator closes with the last env that uses it."""
-        self.sensing = self._street = None  # type: ignore[assignment]
+        """Releases the street, whose simulator closes with the last env that uses it.
+
+        `reset` opens it again.
+        """
+        self.sensing = self._street = self._episode = None  # type: ignore[assignment]
+
+    def _open(self) -> None:
+        self._street = Street.shared(self.scene)
+        self.sensing = Sensing.shared(self._street, *self._camera)
 
     def get_state(self) -> dict[str, Any]:
         """Returns the complete state as JSON-serialisable data."""
@@ -163,14 +349,14 @@ class StreetEnv(gym.Env):
             "before": _plain(episode.before),
         }
 
-    def _resume(self, state: Mapping[str, Any]) -> None:
-        self.np_random.bit_generator.state = state["np_random"]
-        self._begin({name: state[name] for name in _OPTIONS})
+    def _resume(self, state: "_State") -> None:
+        self.np_random.bit_generator.state = state.np_random
+        self._begin({name: getattr(state, name) for name in _OPTIONS})
         episode = self.episode
-        episode.steps, episode.hit = state["steps"], state["hit"]
-        episode.outcome = Outcome[state["outcome"].upper()]
-        both = state["before"], state["now"]
-        episode.resume(*(Moment(VehicleState(*m["vehicle"]), m["ticks"]) for m in both))
+        episode.steps, episode.hit = state.steps, state.hit
+        episode.outcome = Outcome[state.outcome.upper()]
+        both = state.before, state.now
+        episode.resume(*(Moment(VehicleState(*each.vehicle), each.ticks) for each in both))
 
     def _begin(self, options: Mapping[str, Any]) -> None:
         if unknown := sorted(options.keys() - set(_OPTIONS)):
@@ -200,6 +386,52 @@ class StreetEnv(gym.Env):
             "episode_seed": episode.seed,
             "path": episode.path.name,
         }
+
+
+@dataclass(frozen=True)
+class _MomentState(Part):
+    vehicle: tuple[float, float, float, float]
+    ticks: int
+
+
+@dataclass(frozen=True)
+class _State(Part):
+    """What `get_state` returns and `reset` takes."""
+
+    outcome: str
+    hit: str
+    episode_seed: int
+    path: str
+    np_random: dict[str, Any]
+    vehicle_speed_mps: float
+    speed: tuple[float, float]
+    frame_rate_hz: float
+    steps: int
+    now: _MomentState
+    before: _MomentState
+
+    def __post_init__(self) -> None:
+        generator: Any = np.random.PCG64()
+        generator.state = self.np_random
+        if self.hit not in ("", *CATEGORIES):
+            raise ValueError(f"hit is {self.hit!r}")
+        if self.outcome not in [each.label for each in Outcome]:
+            raise ValueError(f"outcome is {self.outcome!r}")
+
+
+_STATE = TypeAdapter(_State)
+
+
+def _checked_state(state: Any) -> _State:
+    try:
+        return _STATE.validate_python(state)
+    except (ValidationError, KeyError, TypeError) as error:  # the last two are numpy's
+        problem = repr(error)
+        if isinstance(error, ValidationError):
+            first = error.errors()[0]
+            key = ".".join(map(str, first["loc"]))
+            problem = f"{key or 'state'}: {first['msg'].removeprefix('Value error, ')}"
+        raise ValueError(f"this is not a state returned by get_state: {problem}") from error
 
 
 def _speed_range(scene: Scene, speed: SpeedMode | Range) -> Range:

@@ -11,7 +11,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
-from flowrep.envs.episode import EPISODE_SEEDS, NOTHING_HIT, Episode, Outcome, reward
+from flowrep.envs.sensing import EPISODE_SEEDS
+from flowrep.envs.street_env import NOTHING_HIT, Episode, Outcome, reward
 from flowrep.envs.workers import copy_into_rows
 
 _STATUS: dict[str, Any] = {
@@ -54,7 +55,6 @@ class StreetVectorEnv(SyncVectorEnv):
                 "environments that are drawn together need the same scene, sensors, renderer and "
                 "picture_scale; make a vector env for each"
             )
-        (self._sensing,) = cameras
         sensor: Any = self.single_observation_space
         nested: dict[str, spaces.Space] = {"sensor": sensor} if sensor.spaces else {}
         self.single_observation_space = spaces.Dict(nested | _STATUS)
@@ -97,17 +97,12 @@ class StreetVectorEnv(SyncVectorEnv):
             rewards[i], ended[i] = reward(outcome), outcome != Outcome.RUNNING
         return self._observe(driven), rewards, ended, np.zeros_like(ended), {}
 
-    def close_extras(self, **kwargs: Any) -> None:
-        """Closes the envs; a street's simulator closes with its last env."""
-        super().close_extras(**kwargs)
-        del self._sensing
-
     def _observe(self, rows: list[int]) -> dict[str, Any]:
         """Renders some envs; the others keep their last observation, which is 0 at first."""
         if not rows:
             return deepcopy(self._latest)
         episodes = [self._streets[row].episode for row in rows]
-        sensor = self._sensing.observe_all(episodes)
+        sensor = self._streets[0].sensing.observe_all(episodes)
         observation = ({"sensor": sensor} if sensor else {}) | _status(episodes)
         if len(rows) < self.num_envs:
             # The caller may still use the arrays of an earlier step: copy them before writing.

@@ -22,7 +22,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from flowrep.baselines import BaselinePolicy
 from flowrep.config.schema import EnvConfig
 from flowrep.envs import Outcome
-from flowrep.envs.episode import hit_name
+from flowrep.envs.street_env import hit_name
 from flowrep.experiment import build
 from flowrep.experiment.outcomes import EpisodeRecord
 from flowrep.progress import progress_bar

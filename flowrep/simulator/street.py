@@ -22,12 +22,12 @@ from flowrep.simulator.paint import texture
 Array = NDArray[Any]
 _TWO_LANES_M = 5.0  # narrower roads have no lane marks
 _HIDDEN_M = -1000.0  # height of absent bodies, out of reach of camera and vehicle
-_SAFE_CELL_M = 0.25  # side of a cell of the table below
+_SAFE_CELL_M = 0.25  # side of a cell of `SafeGround`
 _BOXES_A_BODY = 16  # PyBullet's limit for one compound shape
 
 
 class SafeGround:
-    """A table of the places where a vehicle is certainly clear of edges, boxes and end zones.
+    """Knows the places where a vehicle is certainly clear of edges, boxes and end zones.
 
     Elsewhere, and near people, the exact but slower tests of PyBullet and shapely decide.
     """
@@ -38,20 +38,18 @@ class SafeGround:
         ends = [layout.zones[path.end] for path in layout.scene.paths]
         boxes = [*layout.buildings, *layout.obstacles, *layout.closures.values()]
         unsafe = shapely.union_all([*ends, *(box.footprint for box in boxes)]).buffer(reach)
-        safe = layout.drivable.buffer(-reach).difference(unsafe)
-        self._x0, self._y0, x1, y1 = layout.drivable.bounds
-        x = np.arange(self._x0, x1, _SAFE_CELL_M) + _SAFE_CELL_M / 2
-        y = np.arange(self._y0, y1, _SAFE_CELL_M) + _SAFE_CELL_M / 2
-        shapely.prepare(safe)
-        table = shapely.contains_xy(safe, *np.meshgrid(x, y, indexing="ij"))
-        # Stored as bytes, because Python reads their elements in half the time of an array's.
-        self._columns = [column.astype(np.uint8).tobytes() for column in table]
+        self._safe = layout.drivable.buffer(-reach).difference(unsafe)
+        shapely.prepare(self._safe)
+        self._is_safe: dict[tuple[int, int], bool] = {}  # by cell, of those where one has been
 
     def __call__(self, x_m: float, y_m: float) -> bool:
         """Returns whether the vehicle's centre is on safe ground."""
-        i, j = int((x_m - self._x0) // _SAFE_CELL_M), int((y_m - self._y0) // _SAFE_CELL_M)
-        columns = self._columns
-        return 0 <= i < len(columns) and 0 <= j < len(columns[i]) and columns[i][j] == 1
+        cell = int(x_m // _SAFE_CELL_M), int(y_m // _SAFE_CELL_M)
+        is_safe = self._is_safe.get(cell)
+        if is_safe is None:
+            x, y = ((number + 0.5) * _SAFE_CELL_M for number in cell)
+            is_safe = self._is_safe[cell] = bool(shapely.contains_xy(self._safe, x, y))
+        return is_safe
 
 
 class Street:

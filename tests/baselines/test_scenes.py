@@ -14,7 +14,7 @@ from gymnasium.utils.env_checker import check_env
 
 from flowrep.baselines import Planner
 from flowrep.envs import SCENE_BY_ID
-from flowrep.envs.episode import Moment
+from flowrep.envs.street_env import Moment
 from flowrep.scenes import load_scene, scene_names
 from flowrep.scenes.layout import Layout, free_ground
 from flowrep.scenes.scene import CATEGORY_ID

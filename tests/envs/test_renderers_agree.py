@@ -14,7 +14,7 @@ import pytest
 import shapely
 
 from flowrep.envs import StreetEnv
-from flowrep.envs.episode import Moment
+from flowrep.envs.street_env import Moment
 from flowrep.scenes import load_scene, scene_names
 from flowrep.scenes.scene import CATEGORY_ID
 from flowrep.scenes.vehicle import VehicleState

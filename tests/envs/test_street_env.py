@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from flowrep.envs import StreetEnv
-from flowrep.envs.episode import ticks_for
+from flowrep.envs.street_env import ticks_for
 from flowrep.scenes.scene import Obstacle
 
 NO_OP, LEFT, RIGHT = 0, 1, 2
@@ -106,9 +106,10 @@ def test_turning_all_the_time_leads_off_the_road(make_street, empty_road, action
     assert sum(rewards) == pytest.approx(-5.0 + 0.01 * len(rewards))
 
 
-@pytest.mark.parametrize(("rate_hz", "steps"), [(12.0, 200), (6.0, 100), (7.0, 117)])
+@pytest.mark.parametrize(("rate_hz", "steps"), [(12, 200), (6, 100), (7, 117), (15, 250)])
 def test_the_time_limit_keeps_its_seconds(make_street, empty_road, rate_hz, steps):
     # 200 steps at 12 Hz are 16.67 s; at 7 Hz these are 116.7 steps, so that the 117th is too late.
+    # 200 / 12 · 15 is 250.00000000000003 in floating point.
     env = make_street(empty_road, frame_rate_hz=rate_hz, sensors=())
     rewards, info = drive(env, vehicle_speed_mps=0.0)
     assert info["outcome"] == "timeout"
@@ -246,6 +247,7 @@ def test_an_episode_may_have_a_speed_and_a_frame_rate_of_its_own(make_street):
         ({"speed": (2.0, 1.0)}, r"speed is \(2.0, 1.0\)"),
         ({"speed": (1.0,)}, r"speed is \(1.0,\)"),
         ({"speed": None}, "speed is None"),
+        ({"speed": (1.0, 1e8)}, r"speed is 1e\+08 m/s"),
         ({"speed": ("1", "2")}, r"speed is \('1', '2'\)"),
         ({"frame_rate_hz": 0}, r"frame_rate_hz is 0;"),
         ({"frame_rate_hz": "12"}, r"frame_rate_hz is '12'"),
@@ -286,15 +288,33 @@ def test_reset_options_that_cannot_be_are_refused(make_street, empty_road):
         ("vehicle_speed_mps", "10", "vehicle_speed_mps is '10'"),
         ("speed", (1.0, math.nan), r"speed is \(1.0, nan\)"),
         ("state", 5, "get_state"),
-        ("state", {"steps": 3}, "get_state.*KeyError"),
+        ("state", {"steps": 3}, "get_state: outcome"),
+        # A step of a twelfth of a second would lead past all that is seen, 300 m.
+        ("vehicle_speed_mps", 1e7, r"vehicle_speed_mps is 1e\+07 m/s.* 3600 m/s"),
     ):
         with pytest.raises(ValueError, match=message):
             env.reset(options={option: value})
     state = env.reset(seed=0) and env.get_state()
+    moment = state["now"] | {"vehicle": [0.0, 0.0, None, 0.0]}
+    for key, value in (("outcome", None), ("outcome", "won"), ("hit", "moon"), ("now", moment)):
+        with pytest.raises(ValueError, match=f"get_state: .*{key}"):
+            env.reset(options={"state": state | {key: value}})
+    with pytest.raises(ValueError, match=r"get_state: state.* PCG64"):
+        env.reset(options={"state": state | {"np_random": {}}})
     with pytest.raises(ValueError, match=r"path.*state"):  # it would be ignored
         env.reset(options={"state": state, "path": "main"})
     last = (1 << 62) - 1
     assert env.reset(options={"episode_seed": np.int64(last)})[1]["episode_seed"] == last
+
+
+def test_a_closed_street_opens_again_with_a_reset(make_street, empty_road):
+    env = make_street(empty_road, sensors=("depth",), render_mode="rgb_array")
+    before, _ = env.reset(seed=1)
+    env.close()
+    with pytest.raises(RuntimeError, match="call reset"):
+        env.render()
+    assert same(before, env.reset(seed=1)[0])
+    assert env.render().shape == (84, 84, 3)
 
 
 def test_motion_between_two_steps_is_the_one_driven(make_street, empty_road):

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from flowrep.envs import Outcome, StreetEnv
-from flowrep.envs.episode import hit_name
 from flowrep.envs.sensing import SENSORS
+from flowrep.envs.street_env import hit_name
 from flowrep.envs.vector_env import StreetVectorEnv
 from tests.comparing import differing
 
