@@ -19,7 +19,6 @@ require(
 )  # fmt: skip
 
 from hydra.core.hydra_config import HydraConfig
-from hydra.utils import get_class
 
 from flowrep.config.cli import run_command
 from flowrep.config.schema import FactorizeConfig, check_reader_options
@@ -81,9 +80,13 @@ def factorize_recording(config: FactorizeConfig) -> int:
 
 def open_stream(config: FactorizeConfig) -> sequences.Stream:
     """Returns the recording or camera that `input` and `format` name."""
-    from flowrep.sequences.declared import DeclaredRecording
+    from flowrep.sequences.declared import READERS, DeclaredRecording
 
-    reader, options = get_class(config.format.target), config.format.options()
+    name, options = config.format.target.rpartition(".")[2], config.format.options()
+    if name not in READERS:
+        there = ", ".join(f"flowrep.sequences.{each}" for each in READERS)
+        raise UsageError(f"format._target_={config.format.target}: is no reader; there are {there}")
+    reader = READERS[name]
     check_reader_options(reader, options)
     stream: sequences.Stream = reader(str(config.input), **options)
     if isinstance(stream, DeclaredRecording):

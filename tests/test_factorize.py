@@ -302,6 +302,7 @@ def test_without_poses_the_cameras_motion_is_estimated(moments, tmp_path, capsys
     [
         ("stop", "1"), ("scale_px.obj", "-2"), ("flow_files", "[flo,exr]"), ("flow.preset", "best"),
         ("format.pose_axes", "left_handed"), ("format.depth_kind", "null"), ("+format.scale", "2"),
+        ("format._target_", "flowrep.sequences.Frame"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused_by_name(key, value, moments, tmp_path):

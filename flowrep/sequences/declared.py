@@ -20,8 +20,9 @@ from flowrep.config import CONF_DIR, group_choices
 from flowrep.config.schema import check_reader_options
 from flowrep.sequences import calibration, files
 from flowrep.sequences.calibration import as_pose, camera_matrix
-from flowrep.sequences.recording import Frame, Pose, Recording, SequenceError
-from flowrep.sequences.video import VIDEOS, VideoPictures
+from flowrep.sequences.kitti import Kitti
+from flowrep.sequences.recording import Frame, Pose, Recording, SequenceError, Stream
+from flowrep.sequences.video import VIDEOS, StillVideo, VideoPictures
 from flowrep.usage import closest_first
 
 Floats = NDArray[np.float64]
@@ -142,7 +143,7 @@ class DeclaredRecording(Recording):
         for word in re.findall(r"{(\w+)}", pattern):
             if given.get(word) is None:
                 raise SequenceError(f"format.{word}", f"needs a value, for {pattern}")
-        return self.folder / pattern.format(**given)
+        return self.folder / re.sub(r"{(\w+)}", lambda word: str(given[word[1]]), pattern)
 
     def _file(self, pattern: str, kind: str, name: str, **words: str) -> Path:
         path = self._path(pattern, **words)
@@ -237,7 +238,7 @@ class DeclaredRecording(Recording):
             table = files.read_table(path)
         if self.rows_where is not None:
             column, value = map(str, self.rows_where)
-            table = table[table[:, int(column)] == float(self._path(value).name)]
+            table = table[_column(path, table, int(column)) == float(self._path(value).name)]
         first, end = columns or (self.key_column + 1 if is_keyed else 0, table.shape[1])
         if not len(table) or not first < end <= table.shape[1]:
             size = f"{len(table)} rows of {table.shape[1]}"
@@ -245,13 +246,14 @@ class DeclaredRecording(Recording):
         before = after = np.arange(len(self._names))
         share = np.zeros(len(before))
         if is_keyed and self._times_s is not None and self.rows_by == "time":
-            times_s = _ascending(path, table[:, self.key_column] * self.time_unit_s)
+            keys = _column(path, table, self.key_column)
+            times_s = _ascending(path, keys * self.time_unit_s)
             times_s = times_s + self.pose_offset_s
             before = after = nearest(times_s, self._times_s, self.tolerance_s)
             if self.interpolate:
                 before, after, share = between(times_s, self._times_s, self.tolerance_s)
         elif is_keyed:
-            keys = table[:, self.key_column]
+            keys = _column(path, table, self.key_column)
             row_of = {key: row for row, key in enumerate(keys.tolist())}
             if len(row_of) < len(keys) or not np.isfinite(keys).all():
                 says = "has two rows with the same frame number, or one that is nan or inf"
@@ -284,7 +286,7 @@ class DeclaredRecording(Recording):
                 fixed: Any = "xyz_xyzw" if len(self.marker_from_cam) == 7 else "matrix"
                 marker = np.array(self.marker_from_cam)
                 poses @= as_pose(marker, "marker_from_cam", layout=fixed)
-        lacking, lag = before < 0, self.pose_lag_frames
+        lacking, lag = before < 0, max(-len(lost), min(self.pose_lag_frames, len(lost)))
         lacking |= (np.minimum(before, after) + lag < 0) | (after + lag >= len(lost))
         before, after = (np.where(lacking, 0, rows + lag) for rows in (before, after))
         is_lost = ~lacking & (lost[before] | lost[after])
@@ -430,7 +432,10 @@ class DeclaredRecording(Recording):
         if self.flow_mask is not None:
             mask = self._file(self.flow_mask, "map", name, next=other)
             if mask.is_file():
-                raw[:, files.read_array(mask) != 0] = np.nan
+                unknown = files.read_array(mask)
+                if unknown.shape != raw.shape[1:]:
+                    raise SequenceError(mask, f"has the size {list(unknown.shape)}, flow another")
+                raw[:, unknown != 0] = np.nan
         return raw
 
 
@@ -444,6 +449,13 @@ def positions(values: Floats) -> Indices:
 def _number(name: str) -> int:
     digits = re.search(r"[0-9]+$", name)
     return int(digits[0]) if digits else -1
+
+
+def _column(path: Path, table: Floats, number: int) -> Floats:
+    if not 0 <= number < table.shape[1]:
+        raise SequenceError(path, f"has {table.shape[1]} columns, and none of number {number}")
+    column: Floats = table[:, number]
+    return column
 
 
 def _ascending(path: Path, times_s: Floats) -> Floats:
@@ -482,6 +494,11 @@ def interpolated_pose(before: Pose, after: Pose, share: float) -> Pose:
     return pose
 
 
+READERS: dict[str, type[Stream]] = {
+    reader.__name__: reader for reader in (DeclaredRecording, Kitti, StillVideo)
+}
+
+
 def declaration(format_name: str) -> dict[str, Any]:
     """Returns the keys of `conf/format/<name>.yaml` and of the formats from which it starts."""
     plain: Any = OmegaConf.to_container(OmegaConf.load(CONF_DIR / f"format/{format_name}.yaml"))
@@ -496,13 +513,11 @@ def open_recording(folder: str | Path, format: str, **options: Any) -> Recording
 
     >>> open_recording("rgbd_dataset_freiburg1_desk", "tum", tolerance_s=0.05)  # doctest: +SKIP
     """
-    from flowrep import sequences
-
     if format not in group_choices("format"):
         there = closest_first(format, group_choices("format"))
         raise SequenceError(f"format={format}", f"is unknown; there are: {there}")
     keys = declaration(format) | options
-    reader = getattr(sequences, keys.pop("_target_").rpartition(".")[2])
+    reader: Any = READERS[keys.pop("_target_").rpartition(".")[2]]
     check_reader_options(reader, keys)
     recording: Recording = reader(folder, **keys)
     if isinstance(recording, DeclaredRecording):

@@ -5,7 +5,10 @@ An invalid file raises `SequenceError`, a missing one `OSError`; both name the f
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
+import math
 import re
 import struct
 from collections.abc import Collection
@@ -15,6 +18,8 @@ from typing import Any, Literal, TypeAlias
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+from PIL.Image import DecompressionBombError as _Bomb
 
 from flowrep.extras import require
 from flowrep.sequences.recording import SequenceError
@@ -30,6 +35,8 @@ _SUFFIXES = {
     "numbers": (".txt", ".csv", ".json", ".cam"),
 }
 FLO_TAG = 202021.25
+# More is no frame and no table, but a mistake or a bomb: a small file may ask for all memory.
+_MOST_BYTES, _MOST_PIXELS = 1 << 30, 100_000_000
 _FLO_UNKNOWN, _FLO_LARGEST = 1e10, 1e9  # written for unknown flow; larger values are unknown
 
 
@@ -76,11 +83,20 @@ def with_suffix(path: Path, kind: str) -> Path:
     return next((found for found in paths if found.exists()), path)
 
 
-def regular(path: Path) -> Path:
-    """Returns a path, unless it is a pipe, from which reading might never end."""
+def regular(path: Path, most_bytes: float = _MOST_BYTES) -> Path:
+    """Returns a path, unless it is a pipe, from which reading might never end, or very large."""
     if path.exists() and not path.is_file():
         raise SequenceError(path, "is not a regular file")
+    if path.exists() and path.stat().st_size > most_bytes:
+        raise SequenceError(path, f"has {path.stat().st_size:,} bytes, at most {most_bytes:,} fit")
     return path
+
+
+def check_size(path: Path, *size: int) -> None:
+    """Raises SequenceError for more pixels than a picture has, before memory is taken for them."""
+    if math.prod(size) > _MOST_PIXELS:
+        says = " x ".join(map(str, size))
+        raise SequenceError(path, f"has {says} pixels or numbers, at most {_MOST_PIXELS:,} fit")
 
 
 def read_lines(path: Path) -> list[str]:
@@ -115,8 +131,8 @@ def read_table(path: Path) -> NDArray[np.float64]:
             if lines and not re.match(r"[-+.]?(\d|nan|inf)", lines[0], re.IGNORECASE):
                 del lines[0]
             table = np.loadtxt(lines, ndmin=2) if lines else np.empty(0)
-    except (ValueError, LookupError, TypeError, struct.error) as error:
-        raise SequenceError(path, f"holds no table of numbers {keys}: {error!r}") from None
+    except (ValueError, LookupError, TypeError, ArithmeticError, RecursionError, struct.error) as e:
+        raise SequenceError(path, f"holds no table of numbers {keys}: {e!r}") from None
     if not table.size:
         raise SequenceError(path, "holds no numbers")
     return table
@@ -129,6 +145,7 @@ def read_array(path: Path) -> NDArray[Any]:
         if suffix == ".npy":
             # Memory-mapped; otherwise, memory for the size in a broken header would be allocated.
             mapped = np.load(regular(path), mmap_mode="r")
+            check_size(path, *mapped.shape)
             array = np.array(mapped) if isinstance(mapped, np.ndarray) else None
         elif suffix in (".flo", ".dpt"):
             data = regular(path).read_bytes()
@@ -141,20 +158,22 @@ def read_array(path: Path) -> NDArray[Any]:
         elif suffix == ".flo5":
             raise SequenceError(path, "is HDF5, which isn't read: convert it to .flo or .npy")
         else:
-            array = _decoded(regular(path).read_bytes())
-    except (ValueError, EOFError, RuntimeError, struct.error, cv2.error) as error:
+            array = _decoded(path, regular(path).read_bytes())
+    except (ValueError, EOFError, RuntimeError, struct.error, cv2.error, _Bomb) as error:
         raise SequenceError(path, f"can't be read as {suffix}: {error}") from None
     if array is None:
         raise SequenceError(path, f"is no {suffix} file, or was cut off")
     return array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
 
 
-def _decoded(data: bytes) -> NDArray[Any] | None:
+def _decoded(path: Path, data: bytes) -> NDArray[Any] | None:
     # Before version 5, OpenCV silently fills a truncated picture with grey, so look for the end
     # marker. Some cameras write a few bytes after it.
     end = {b"\x89P": b"IEND", b"\xff\xd8": b"\xff\xd9"}.get(data[:2], b"")
     if not data or end not in data[-4096:]:
         return None
+    with contextlib.suppress(UnidentifiedImageError):  # OpenCV reads more kinds, e.g. .pfm
+        check_size(path, *Image.open(io.BytesIO(data)).size)
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if picture is None or picture.ndim == 2:
         return picture
@@ -166,6 +185,8 @@ def _read_exr(path: Path) -> NDArray[Any]:
     require("reading .exr", "exr", "OpenEXR")
     import OpenEXR
 
+    window = OpenEXR.File(str(regular(path)), header_only=True).header()["dataWindow"]
+    check_size(path, *(int(last) - int(first) + 1 for first, last in zip(*window)))
     planes = OpenEXR.File(str(regular(path)), separate_channels=True).channels()
     name = min(planes, key=lambda name: (f"ZRYV{name[-1]}".index(name[-1]), name))
     pixels: NDArray[Any] = planes[name].pixels

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from itertools import count, islice
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrep.sequences.calibration import camera_matrix
+from flowrep.sequences.files import regular
 from flowrep.sequences.recording import Frame, SequenceError
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv")
@@ -68,7 +70,7 @@ class VideoPictures:
     """The pictures of a video file by their numbers."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        self.path = regular(path, math.inf)
         self._next, self._pictures = 0, iter(list[NDArray[np.uint8]]())
 
     def __getitem__(self, index: int) -> NDArray[np.uint8]:

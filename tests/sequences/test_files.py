@@ -8,6 +8,8 @@ import os
 import re
 import signal
 import struct
+import zlib
+from functools import partial
 
 import numpy as np
 import pytest
@@ -168,6 +170,33 @@ def npy_header(shape) -> bytes:
     return file.getvalue()
 
 
+def png_header(width, height) -> bytes:
+    parts = (b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0), b"IDAT", b"IEND")
+    chunks = (struct.pack(">I", len(p) - 4) + p + struct.pack(">I", zlib.crc32(p)) for p in parts)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
+
+
+@pytest.mark.parametrize("size", [(30_000, 5_000), (30_000, 30_000)])
+def test_a_picture_that_would_take_all_memory_is_refused_before_it_is_decoded(size, tmp_path):
+    synthetic.write_frames(tmp_path)
+    put(tmp_path / "rgb/0001.png", png_header(*size))
+    assert "pixels" in refusal(lambda: sequences.open_recording(tmp_path, "frames"), "0001.png")
+
+
+def test_a_file_that_is_larger_than_any_table_is_not_read(tmp_path):
+    synthetic.write_frames(tmp_path)
+    with (tmp_path / "poses.txt").open("r+b") as file:
+        file.truncate(2**31)  # takes no room on disk
+    assert "bytes" in refusal(lambda: sequences.open_recording(tmp_path, "frames"), "poses.txt")
+
+
+@pytest.mark.parametrize("content", ["[" * 200_000, '{"a": [1%s]}' % ("0" * 400)])
+def test_json_that_no_number_holds_ends_in_a_line(content, tmp_path):
+    synthetic.write_frames(tmp_path)
+    put(tmp_path / "k.json", [content])
+    refusal(lambda: sequences.open_recording(tmp_path, "frames", intrinsics="k.json:a"), "k.json")
+
+
 # Format, file, what it holds: what no memory, no patience and no shape would be enough for.
 BROKEN = [
     ("frames", "depth/0001.npy", npy_header((400_000, 400_000))),  # 596 GiB
@@ -188,10 +217,18 @@ def test_a_size_that_cannot_be_ends_in_a_line(name, file, content, tmp_path):
     refusal(lambda: open_it(tmp_path), file.split("/")[-1])
 
 
+def write_video(folder):
+    synthetic.write_frames(folder)
+    put(folder / "video.mp4", b"no video")
+
+
+open_video = partial(sequences.open_recording, format="frames", rgb="video.mp4")
+
+
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", [*FORMATS, "a video"])
 def test_a_pipe_is_refused_and_not_waited_for(name, tmp_path):
-    write, open_it, *_ = FORMATS[name]
+    write, open_it, *_ = (FORMATS | {"a video": (write_video, open_video)})[name]
     write(tmp_path)
 
     def too_long(*_):
@@ -219,6 +256,17 @@ def test_flo5_is_named_as_what_it_is(tmp_path):
     (tmp_path / "flow/0001.flo").rename(tmp_path / "flow/0001.flo5")
     says = refusal(lambda: sequences.open_recording(tmp_path, "frames"), "0001.flo5")
     assert ".flo" in says
+
+
+@pytest.mark.parametrize(
+    "options", [{"rows_by": "number", "key_column": 99}, {"rows_where": [99, 0]}]
+)
+def test_a_column_that_a_table_lacks_is_named(options, tmp_path):
+    synthetic.write_frames(tmp_path)
+    says = refusal(
+        lambda: sequences.open_recording(tmp_path, "frames", **options), "timestamps.txt"
+    )
+    assert "99" in says
 
 
 def test_a_unit_of_depth_is_positive(tmp_path):
