@@ -19,7 +19,7 @@ require("evaluation", "train", "hydra", "pydantic", module=__name__)
 
 from flowrep.config.cli import EXIT_USAGE, folder_name, is_a_mistake, print_error, run_command
 from flowrep.config.schema import EvaluateConfig, check_policy
-from flowrep.stop import StopRequest
+from flowrep.progress import StopRequest
 from flowrep.usage import UsageError
 
 if TYPE_CHECKING:

@@ -1,14 +1,17 @@
-"""Files that are written whole or not at all, and never through a link."""
+"""Files that are written whole or not at all and never through a link, and tables in them."""
 
 from __future__ import annotations
 
+import csv
 import errno
+import io
+import math
 import os
 import secrets
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from glob import escape
 from itertools import count
 from pathlib import Path
@@ -17,55 +20,42 @@ from typing import IO, Any
 _REFUSED = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES)
 
 
-def replace_file(path: Path, write: Callable[[Path], Any]) -> None:
-    """Calls `write` with another path, and renames the file to `path` once it is on disk.
+@contextmanager
+def replace_file(path: Path) -> Iterator[Path]:
+    """Yields another path to write to, and renames that file to `path` once it is on disk.
 
-    If that is interrupted, the previous file stays. An OSError names `path`.
+    If that is interrupted, the previous file stays. A link is replaced. An OSError names `path`.
     """
-    _replace(path.parent, [path.name], lambda partial: write(partial / path.name))
+    # In a new folder no name is a link, and whatever writers leave beside their file goes with it.
+    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
+    with naming(path):
+        for left in path.parent.glob(f".{escape(path.name)}.*partial"):  # of killed writers
+            shutil.rmtree(left, ignore_errors=True)
+        try:
+            partial.mkdir()
+            yield partial / path.name
+            # As of any new file; some writers set another mode.
+            (partial / path.name).chmod(partial.stat().st_mode & 0o666)
+            _flush(partial / path.name)
+            _rename(partial / path.name, path)
+            _flush(path.parent)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
 
 
 def replace_text(path: Path, text: str) -> None:
     """Replaces a file by one of this text, in UTF-8."""
-    replace_file(path, lambda partial: partial.write_text(text, encoding="utf-8"))
+    with replace_file(path) as partial:
+        partial.write_text(text, encoding="utf-8")
 
 
-def replace_files(folder: Path, files: Mapping[str, bytes], *, as_one: bool = False) -> None:
-    """Replaces files of a folder by these, given by name, once all are on disk.
-
-    They are renamed in their order. With `as_one`, old and new files are never mixed: the old ones
-    are removed first, beginning with the last of `files`, so if that one is there, all are.
-    """
-
-    def write(partial: Path) -> None:
+def replace_files(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Replaces files of a folder by these, given by name, once all are on disk."""
+    with ExitStack() as all_written:
         for name, data in files.items():
-            (partial / name).write_bytes(data)
-
-    _replace(folder, list(files), write, as_one)
-
-
-def _replace(
-    folder: Path, names: Sequence[str], write: Callable[[Path], Any], as_one: bool = False
-) -> None:
-    # In a new folder no name is a link, and whatever writers leave beside their file goes with it.
-    partial = folder / f".{names[-1]}.{secrets.token_hex(4)}.partial"
-    with naming(folder if names[1:] else folder / names[0]):
-        for left in folder.glob(f".{escape(names[-1])}.*partial"):  # of writers that were killed
-            shutil.rmtree(left, ignore_errors=True)
-        try:
-            partial.mkdir()
-            write(partial)
-            mode = partial.stat().st_mode & 0o666  # as of any new file; some writers set another
-            for name in names:
-                (partial / name).chmod(mode)
-                _flush(partial / name)
-            for name in reversed(names) if as_one else ():
-                (folder / name).unlink(missing_ok=True)
-            for name in names:
-                _rename(partial / name, folder / name)
-            _flush(folder)
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
+            partial = all_written.enter_context(replace_file(folder / name))
+            partial.write_bytes(data)
+            _flush(partial)
 
 
 def _rename(file: Path, path: Path) -> None:
@@ -81,6 +71,18 @@ def _flush(path: Path) -> None:
         os.close(descriptor)
 
 
+def refuse_link(path: Path) -> Path:
+    """Returns the path of a file or folder to write to, in a folder that may be a stranger's."""
+    if path.is_symlink():
+        raise _is_link(path)
+    return path
+
+
+def _is_link(path: str | Path) -> OSError:
+    what = "it is a link, and flowrep doesn't write through links: replace it by what it points to"
+    return OSError(errno.ELOOP, what, str(path))
+
+
 def open_to_append(path: Path) -> IO[bytes]:
     """Opens or creates a file to append bytes without a buffer; a link is refused."""
     return open(str(path), "ab", buffering=0, opener=_open_no_link)
@@ -91,10 +93,7 @@ def _open_no_link(path: str, flags: int) -> int:
         # Not blocking, as a named pipe would wait for a reader.
         return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
     except OSError as error:
-        if error.errno != errno.ELOOP:
-            raise
-        what = "it is a link, and flowrep doesn't write through links: replace it by the file"
-        raise OSError(errno.ELOOP, what, path) from None
+        raise (_is_link(path) if error.errno == errno.ELOOP else error) from None
 
 
 @contextmanager
@@ -118,3 +117,105 @@ def set_aside(path: Path, problem: object) -> None:
     path.rename(other)
     what = " ".join(str(problem).split())
     print(f"warning: {path} is damaged ({what}); it is {other.name} now", file=sys.stderr)
+
+
+# Tables (CSV) that stay readable if a process is killed while it appends rows.
+
+
+class TableError(ValueError):
+    """A table is damaged, or another program's."""
+
+
+def whole_number(cell: str) -> int:
+    """Returns a cell's whole number; raises ValueError unless 64 bits hold it."""
+    value = int(cell)
+    if abs(value) >= 2**63:
+        raise ValueError(f"{cell} has more than 64 bits")
+    return value
+
+
+def finite_number(cell: str) -> float:
+    """Returns a cell's number; raises ValueError for inf and nan."""
+    if not math.isfinite(value := float(cell)):
+        raise ValueError(f"{cell} is not finite")
+    return value
+
+
+def read_rows(
+    path: Path,
+    columns: Iterable[str] = (),
+    checks: Mapping[str, Callable[[str], Any]] | None = None,
+) -> list[dict[str, str]]:
+    """Returns a table's rows, none if there is no file; an incomplete last line is left out.
+
+    Raises:
+        TableError: one of `columns` is missing, as after a spreadsheet saved the table with
+            semicolons; or a column's check raises a ValueError for a cell.
+    """
+    if not path.is_file():
+        return []
+    data = path.read_bytes()
+    text = data[: data.rfind(b"\n") + 1].decode("utf-8-sig", errors="replace")
+    table = csv.DictReader(io.StringIO(text, newline=""))
+    try:
+        rows = list(table)
+    except csv.Error as error:
+        raise TableError(f"{path} is no table: {error}; move it aside") from None
+    missing = [name for name in columns if name not in (table.fieldnames or ())]
+    if rows and (missing or any(None in row.values() or None in row for row in rows)):
+        raise TableError(
+            f"{path} lacks {', '.join(missing) or 'cells in a line'}: perhaps another program or "
+            "version wrote it; move it aside, or export it again with commas"
+        )
+    for number, row in enumerate(rows, start=1):
+        for name, check in (checks or {}).items():
+            try:
+                check(row[name])
+            except ValueError:
+                raise TableError(
+                    f"{path}: {name} is {row[name]!r} in row {number}, which flowrep never writes: "
+                    "restore the table, or move it aside"
+                ) from None
+    return rows
+
+
+def is_whole(path: Path) -> bool:
+    """Returns whether a table ends with a complete line, or does not exist."""
+    return not path.is_file() or path.read_bytes().endswith(b"\n")
+
+
+def write_rows(
+    path: Path, rows: Iterable[Mapping[str, Any]], columns: Iterable[str] | None = None
+) -> None:
+    """Replaces a whole table, or leaves the old one; without rows, the file is removed."""
+    if rows := list(rows):
+        with replace_file(path) as partial:
+            append_rows(partial, rows, columns)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def append_rows(
+    path: Path, rows: Iterable[Mapping[str, Any]], columns: Iterable[str] | None = None
+) -> None:
+    """Appends rows to a table; a new one gets a header."""
+    rows = list(rows)
+    if not rows:
+        return
+    is_new = not path.is_file() or path.stat().st_size == 0
+    if is_new:
+        names = list(columns or rows[0])
+    else:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            names = next(csv.reader(file))
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, names)
+    if is_new:
+        writer.writeheader()
+    writer.writerows(rows)
+    # In one call, so that a process that is killed leaves all rows or none.
+    with naming(path), open_to_append(path) as raw:
+        data = text.getvalue().encode("utf-8")
+        written = raw.write(data)
+        while written < len(data):  # an almost full disk takes a part, and raises at the next call
+            written += raw.write(data[written:])

@@ -1,12 +1,19 @@
-"""How far a long loop is, and where its time goes: a progress bar and a stopwatch."""
+"""Long loops: how far one is, where its time goes, and a stop between two of its steps."""
 
 import io
+import os
+import select
+import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from types import FrameType
+from typing import Any, ClassVar
+
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
+"""Ctrl-C; what schedulers send; a closed terminal; what SLURM's --signal=USR1@300 sends."""
 
 LINE_EVERY_S = 30.0
 _LOCK = threading.RLock()
@@ -81,3 +88,62 @@ class Stopwatch:
         """Returns the share of each section in one line, the largest first."""
         ordered = sorted(self.seconds, key=self.seconds.__getitem__, reverse=True)
         return ", ".join(f"{name} {self.share(name):.0%}" for name in ordered)
+
+
+class StopRequest:
+    """Turns `STOP_SIGNALS` into a flag that the loop checks between two steps.
+
+    The first signal sets `received` and calls `then`. A second Ctrl-C ends the process at once; a
+    second SIGTERM doesn't, since schedulers send it to each process of a job and more than once.
+    If SIGHUP is ignored, as under `nohup`, it stays so. The previous handlers are restored when the
+    context ends. In another thread than the main one, a request never comes.
+    """
+
+    was_received: ClassVar[bool] = False
+    """Whether a stop was requested in a context that has not ended yet: keep waits short then."""
+
+    def __init__(self, then: Callable[[], Any] = lambda: None) -> None:
+        self.received: signal.Signals | None = None
+        self._then = then
+        self._previous: dict[signal.Signals, Any] = {}
+
+    @property
+    def exit_code(self) -> int:
+        """The exit code that shells expect of a process ended by the signal."""
+        return 0 if self.received is None else 128 + self.received
+
+    def __bool__(self) -> bool:
+        return self.received is not None
+
+    def __enter__(self) -> "StopRequest":
+        if threading.current_thread() is not threading.main_thread():
+            return self  # signals reach the main thread alone
+        for number in STOP_SIGNALS:
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+                self._previous[number] = signal.signal(number, self._receive)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        StopRequest.was_received = False
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _receive(self, number: int, _: FrameType | None) -> None:
+        if number == signal.SIGHUP:
+            _leave_closed_terminal()
+        if self.received is None:
+            self.received = signal.Signals(number)
+            StopRequest.was_received = True
+            self._then()
+        signal.signal(signal.SIGINT, self._previous[signal.SIGINT])
+
+
+def _leave_closed_terminal() -> None:
+    """Discards further output if its terminal was closed, as printing would raise an error."""
+    for descriptor in (1, 2):
+        poll = select.poll()
+        poll.register(descriptor, 0)  # hang-ups and errors are always reported
+        if poll.poll(0):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, descriptor)
+            os.close(nowhere)

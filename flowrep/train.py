@@ -24,7 +24,7 @@ from flowrep.config.schema import TrainConfig
 from flowrep.experiment import sweep
 from flowrep.experiment.outcomes import is_finished, success_of
 from flowrep.options import ALGORITHMS
-from flowrep.stop import StopRequest
+from flowrep.progress import StopRequest
 from flowrep.usage import UsageError
 
 if TYPE_CHECKING:

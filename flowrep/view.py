@@ -21,9 +21,8 @@ from hydra.core.hydra_config import HydraConfig
 
 from flowrep.config.cli import folder_name, run_command
 from flowrep.config.schema import ViewConfig, check_policy, policy_kind
-from flowrep.files import replace_files
+from flowrep.files import replace_files, write_rows
 from flowrep.progress import progress_bar
-from flowrep.tables import write_rows
 from flowrep.usage import UsageError
 from flowrep.viz import contact_sheet, write_png, write_video
 

@@ -21,25 +21,23 @@ FLOWREP_IMPORTS_ALLOWED = {
     "scenes": {"scenes", "yaml_file", "usage", "extras", "choices"},
     "simulator": {"simulator", "scenes", "extras", "choices"},
     "envs": {"envs", "simulator", "scenes", "transforms", "geometry", "extras"}
-    | {"stop", "choices"},
+    | {"progress", "choices"},
     "pybullet": {"simulator", "extras"},
     "baselines": {"baselines", "envs", "scenes"},
     "experiment": {"experiment", "baselines", "envs", "simulator", "scenes", "agent"}
-    | {"transforms", "geometry", "progress", "stop", "tables", "config", "extras", "viz"}
+    | {"transforms", "geometry", "progress", "config", "extras", "viz"}
     | {"files", "options", "yaml_file", "usage"},
     "progress": set(),
-    "stop": set(),
     "usage": set(),
-    "tables": {"files"},
     "viz": {"viz", "scenes", "geometry", "files"},
-    "sequences": {"sequences", "config", "progress", "stop", "usage", "tables", "extras"}
+    "sequences": {"sequences", "config", "progress", "usage", "files", "extras"}
     | {"transforms", "geometry", "viz", "diagnosis"},
     "config": {"config", "choices", "options", "scenes", "yaml_file", "usage"},
     "choices": set(),
     "options": set(),
     "yaml_file": {"usage"},
     "report": {"report", "viz", "config", "experiment", "agent", "envs", "scenes"}
-    | {"extras", "tables", "files", "choices", "usage"},
+    | {"extras", "files", "choices", "usage"},
 }
 THIRD_PARTY_ONLY_IN = {
     "pybullet": {"simulator/bullet.py", "pybullet.py"},

@@ -23,7 +23,7 @@ from flowrep.experiment.exported import export
 from flowrep.experiment.external import PolicyError
 from flowrep.experiment.run import RunFolder
 from flowrep.experiment.runner import Runner
-from flowrep.tables import TableError, read_rows
+from flowrep.files import TableError, read_rows
 from flowrep.usage import UsageError
 from tests.config.composing import composed, plain
 

@@ -3,11 +3,22 @@
 import errno
 import os
 import stat
+from contextlib import suppress
 
 import pytest
 
 from flowrep import files
-from flowrep.files import open_to_append, replace_file, replace_files, replace_text, set_aside
+from flowrep.files import (
+    append_rows,
+    is_whole,
+    open_to_append,
+    read_rows,
+    replace_file,
+    replace_files,
+    replace_text,
+    set_aside,
+    write_rows,
+)
 
 
 @pytest.fixture
@@ -62,24 +73,22 @@ def test_whatever_fails_the_file_is_the_old_one_and_the_error_names_it(folder, m
     if step != "write":
         monkeypatch.setattr(files, step, fails)
 
-    def write(partial):
-        partial.write_text("half")
-        if step == "write":
-            fails()
+    def write():
+        with replace_file(path) as partial:
+            partial.write_text("half")
+            if step == "write":
+                fails()
 
     with pytest.raises(OSError, match=r"a\.txt'$") as caught:
-        replace_file(path, write)
+        write()
     assert caught.value.errno == errno.ENOSPC
     assert (names(folder), path.read_text()) == (["a.txt"], "old")
 
 
 def test_an_interrupted_writer_leaves_nothing(folder):
-    def write(partial):
+    with suppress(KeyboardInterrupt), replace_file(folder / "a.txt") as partial:
         partial.write_text("half")
         raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        replace_file(folder / "a.txt", write)
     assert names(folder) == []
 
 
@@ -131,33 +140,12 @@ def test_a_folder_that_is_a_link_to_another_disk_is_used(folder, tmp_path):
 OLD, NEW = {"a": b"1", "b": b"1", "c": b"1"}, {"a": b"2", "b": b"2", "c": b"2"}
 
 
-@pytest.mark.parametrize("as_one", [True, False])
-def test_of_several_files_a_full_disk_replaces_none(folder, monkeypatch, as_one):
-    replace_files(folder, OLD, as_one=as_one)
+def test_of_several_files_a_full_disk_replaces_none(folder, monkeypatch):
+    replace_files(folder, OLD)
     monkeypatch.setattr(files, "_flush", fails)
-    with pytest.raises(OSError, match=f"'{folder}'"):
-        replace_files(folder, NEW, as_one=as_one)
+    with pytest.raises(OSError, match=f"'{folder}/"):
+        replace_files(folder, NEW)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == OLD
-
-
-@pytest.mark.parametrize("count", range(3))
-def test_files_that_are_one_are_never_there_beside_older_ones(folder, monkeypatch, count):
-    """As after a kill once so many have been renamed."""
-    replace_files(folder, OLD, as_one=True)
-    rename, left = files._rename, [count]
-
-    def killed(*paths):
-        left[0] -= 1
-        if left[0] < 0:
-            raise KeyboardInterrupt
-        rename(*paths)
-
-    monkeypatch.setattr(files, "_rename", killed)
-    with pytest.raises(KeyboardInterrupt):
-        replace_files(folder, NEW, as_one=True)
-    assert {path.name: path.read_bytes() for path in folder.iterdir()} == dict(
-        [*NEW.items()][:count]
-    )
 
 
 def test_a_damaged_file_is_kept_under_a_name_of_its_own(folder, capsys):
@@ -172,3 +160,36 @@ def test_a_damaged_file_is_kept_under_a_name_of_its_own(folder, capsys):
         assert name in line
         assert (folder / name).read_text() == text
         kept.add(name)
+
+
+# Tables.
+
+
+def test_rows_come_back_as_text(tmp_path):
+    table = tmp_path / "t.csv"
+    append_rows(table, [{"a": 1, "b": "x, y"}])
+    append_rows(table, [{"a": 2, "b": 'with "quotes"\nand a line'}])
+    assert read_rows(table) == [
+        {"a": "1", "b": "x, y"},
+        {"a": "2", "b": 'with "quotes"\nand a line'},
+    ]
+    assert read_rows(tmp_path / "none.csv") == []
+
+
+@pytest.mark.parametrize("lost", [1, 3, 6])
+def test_half_a_last_line_is_left_out(tmp_path, lost):
+    table = tmp_path / "t.csv"
+    append_rows(table, [{"a": 1, "b": 2}, {"a": 123, "b": 456}])
+    assert is_whole(table)
+    table.write_bytes(table.read_bytes()[:-lost])
+    assert not is_whole(table)
+    assert read_rows(table) == [{"a": "1", "b": "2"}]
+
+
+def test_a_table_is_replaced_as_a_whole(tmp_path):
+    table = tmp_path / "t.csv"
+    write_rows(table, [{"a": 1}, {"a": 2}])
+    write_rows(table, [{"a": 3}])
+    assert read_rows(table) == [{"a": "3"}]
+    write_rows(table, [])
+    assert list(tmp_path.iterdir()) == []

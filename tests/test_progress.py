@@ -11,15 +11,14 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from flowrep.progress import progress_bar
-from flowrep.stop import StopRequest
+from flowrep.progress import StopRequest, progress_bar
 from tests.running import run_python
 
 
 @pytest.mark.parametrize(
     ("number", "code"),
-    [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)],
-    ids=["ctrl-c", "sigterm", "sighup"],
+    [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129), (signal.SIGUSR1, 138)],
+    ids=["ctrl-c", "sigterm", "sighup", "slurm"],
 )
 def test_a_signal_asks_and_the_shell_gets_its_exit_code(number, code):
     with StopRequest() as stop:
@@ -158,7 +157,7 @@ HANGS_UP = """
 import sys, time
 from pathlib import Path
 from flowrep.progress import progress_bar
-from flowrep.stop import StopRequest
+from flowrep.progress import StopRequest
 
 with StopRequest() as stop, progress_bar(what="x", total=9, mininterval=0, miniters=0) as bar:
     print("ready", flush=True)

@@ -11,7 +11,7 @@ import yaml
 
 pytest.importorskip("pybullet", reason="training drives the simulated street")
 
-from flowrep.tables import read_rows
+from flowrep.files import read_rows
 from flowrep.train import main
 from flowrep.viz import is_playable
 from tests.running import ENVIRONMENT, run_python

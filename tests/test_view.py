@@ -11,8 +11,8 @@ pytest.importorskip("pybullet", reason="the command needs the simulator")
 
 from flowrep.config.schema import ViewConfig, validated
 from flowrep.experiment.film import Film
+from flowrep.files import read_rows
 from flowrep.scenes import load_scene
-from flowrep.tables import read_rows
 from flowrep.usage import UsageError
 from flowrep.view import (
     FILES,

@@ -19,7 +19,6 @@ import os
 import re
 import zlib
 from collections.abc import Callable, Collection, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +56,8 @@ def save_checkpoint(path: str | os.PathLike[str], state: Mapping[str, Any]) -> N
     try:
         with naming(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-        replace_file(path, partial(_write, tensors, metadata))
+        with replace_file(path) as partial:
+            _write(tensors, metadata, partial)
     except OSError as error:
         kept = "; the previous checkpoint is untouched" if path.exists() else ""
         raise CheckpointError(f"cannot write the checkpoint: {error}{kept}") from error

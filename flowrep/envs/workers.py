@@ -22,7 +22,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import batch_space, create_shared_memory, read_from_shared_memory
 from numpy.typing import NDArray
 
-from flowrep.stop import STOP_SIGNALS, StopRequest
+from flowrep.progress import STOP_SIGNALS, StopRequest
 
 Arrays = dict[str, Any]  # arrays, nested like a Dict space
 EnvFactory = Callable[[], gym.Env]

@@ -38,8 +38,8 @@ from flowrep.experiment.external import Task, check_card, load_policy
 from flowrep.experiment.outcomes import EpisodeRecord
 from flowrep.experiment.run import RunFolder, check_origin, origin_of
 from flowrep.experiment.runner import Runner
+from flowrep.progress import StopRequest
 from flowrep.scenes import Scene, load_scene
-from flowrep.stop import StopRequest
 from flowrep.transforms.stack import REPRESENTATIONS, representation_options
 from flowrep.usage import UsageError, closest_first
 

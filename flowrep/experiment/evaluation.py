@@ -25,9 +25,8 @@ from flowrep.envs import Outcome
 from flowrep.envs.street_env import hit_name
 from flowrep.experiment import build
 from flowrep.experiment.outcomes import EpisodeRecord
-from flowrep.progress import progress_bar
+from flowrep.progress import StopRequest, progress_bar
 from flowrep.scenes import Scene
-from flowrep.stop import StopRequest
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 

@@ -95,4 +95,4 @@ def write_agent(folder: Path, program: ExportedProgram, card: Mapping[str, Any])
     files[LOADER] = Path(exported_loader.__file__).read_bytes()  # no checksum: it may be edited
     files[CARD] = (json.dumps({**card, "crc32": digests}, indent=2) + "\n").encode()
     folder.mkdir(parents=True, exist_ok=True)
-    replace_files(folder, files, as_one=True)
+    replace_files(folder, files)

@@ -16,7 +16,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from flowrep.tables import read_rows
+from flowrep.files import finite_number, read_rows, whole_number
 
 if TYPE_CHECKING:
     import numpy as np
@@ -71,7 +71,8 @@ EVALUATION_COLUMNS = tuple(_FIELDS)
 
 _LATER = ("scene_id", "path")  # columns that older tables lack; they are read as empty
 _CHECKS: dict[str, Callable[[str], Any]] = {
-    "frames": int, "fps": float, "outcome": OUTCOMES.index,
+    "frames": whole_number, "fps": finite_number, "episode_seed": whole_number,
+    "length": whole_number, "outcome": OUTCOMES.index,
 }  # fmt: skip
 """How cells of evaluation.csv are checked: a misspelt outcome would count as a failure."""
 

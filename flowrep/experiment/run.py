@@ -11,8 +11,10 @@ import os
 import platform
 import shutil
 import subprocess
+import zipfile
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -30,8 +32,18 @@ from flowrep.experiment.outcomes import (
     failure_causes,
     read_episodes,
 )
-from flowrep.files import replace_file, replace_text, set_aside
-from flowrep.tables import TableError, append_rows, is_whole, read_rows, write_rows
+from flowrep.files import (
+    TableError,
+    append_rows,
+    is_whole,
+    read_rows,
+    refuse_link,
+    replace_file,
+    replace_text,
+    set_aside,
+    whole_number,
+    write_rows,
+)
 from flowrep.usage import UsageError
 from flowrep.yaml_file import read_yaml
 
@@ -39,6 +51,8 @@ if TYPE_CHECKING:
     import torch
 
 DRIVES = "drives.npz"
+_TIMES = ("started", "ended")
+_MOST_BYTES = 2**30  # of unpacked drives: 2,000 bytes each for half a million episodes
 
 _IDENTITY = (
     "scene", "representations", "flow", "motion", "noise", "algorithm", "speed", "seed", "num_envs",
@@ -136,6 +150,10 @@ def read_drives(path: Path) -> dict[DriveKey, tuple[str, NDArray[np.float32]]]:
     if not path.is_file():
         return {}
     try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(part.file_size for part in archive.infolist())
+        if size > _MOST_BYTES:
+            raise ValueError(f"holds {size:,} bytes, more than {_MOST_BYTES:,}")
         with np.load(path, allow_pickle=False) as saved:
             names = zip(*(saved[column].tolist() for column in DriveKey._fields), strict=True)
             positions = np.split(saved["positions"].reshape(-1, 2), saved["starts"][1:-1])
@@ -172,7 +190,8 @@ class RunFolder:
     @classmethod
     def all_in(cls, path: str | Path) -> list[RunFolder]:
         """Opens a run's folder, or all run folders in a sweep's folder."""
-        runs = sorted(config.parent for config in Path(path).glob("*/config.yaml"))
+        configs = filter(Path.is_file, Path(path).glob("*/config.yaml"))
+        runs = sorted(config.parent for config in configs)
         is_sweep = runs and not (Path(path) / "config.yaml").is_file()
         return [cls(run) for run in runs] if is_sweep else [cls.existing(path)]
 
@@ -192,6 +211,8 @@ class RunFolder:
     def held(self, doing: str, patience_s: float = 0.0) -> Iterator[None]:
         """Locks the folder against other processes, see `locked`."""
         self.path.mkdir(parents=True, exist_ok=True)
+        for name in ("checkpoint", "tensorboard", "videos", "wandb", ".hydra"):
+            refuse_link(self.path / name)
         with locked(self.path, doing, patience_s) as self._lock:
             try:
                 yield
@@ -247,20 +268,25 @@ class RunFolder:
         return validated_run(self.read_config(), str(self.config_path), trusted)
 
     def note_machine(self, machine: Mapping[str, Any]) -> None:
-        """Appends a machine to machine.json, unless it is already the last entry."""
+        """Notes in machine.json that a machine works on the run, from `started` to `ended` (UTC).
+
+        If the last entry is of this machine, it is made longer.
+        """
         self._prepare()
-        path = self.path / "machine.json"
+        path, now = self.path / "machine.json", datetime.now(UTC).isoformat(timespec="seconds")
         machines: Any = []
         if path.is_file():
             try:
                 machines = json.loads(path.read_text(encoding="utf-8"))
-                if not isinstance(machines, list):
+                if not (isinstance(machines, list) and all(isinstance(m, dict) for m in machines)):
                     raise ValueError("no list of machines")
             except (ValueError, RecursionError) as error:
                 set_aside(path, error)
                 machines = []
-        if machines[-1:] != [machine]:
-            replace_text(path, json.dumps([*machines, machine], indent=1) + "\n")
+        entry = {**machine, "started": now, "ended": now}
+        if machines and machines[-1] == entry | {k: machines[-1].get(k) for k in _TIMES}:
+            entry["started"] = machines.pop()["started"] or now
+        replace_text(path, json.dumps([*machines, entry], indent=1) + "\n")
 
     def log_metrics(self, frames: int, metrics: Mapping[str, float]) -> None:
         """Appends one row to metrics.csv and logs the same values to TensorBoard and wandb."""
@@ -295,7 +321,7 @@ class RunFolder:
 
     def read_metrics(self) -> list[dict[str, str]]:
         """Returns the rows of metrics.csv, none if there is no such file."""
-        return read_rows(self.metrics_path, ["frames"], {"frames": int})
+        return read_rows(self.metrics_path, ["frames"], {"frames": whole_number})
 
     def read_episodes(self) -> list[dict[str, str]]:
         """Returns the rows of evaluation.csv, none if there is no such file."""
@@ -336,7 +362,8 @@ class RunFolder:
         arrays: dict[str, Any] = dict(zip(DriveKey._fields, map(np.array, zip(*drives))))
         arrays["outcome"], arrays["positions"] = np.array(outcomes), np.concatenate(positions)
         arrays["starts"] = np.cumsum([0, *map(len, positions)])
-        replace_file(self.drives_path, lambda path: np.savez_compressed(path, **arrays))
+        with replace_file(self.drives_path) as partial:
+            np.savez_compressed(partial, **arrays)
 
     def write_failures(self) -> None:
         """Writes the causes of the failures in evaluation.csv to failures.csv."""

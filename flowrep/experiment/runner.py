@@ -16,6 +16,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from flowrep.agent import (
+    CheckpointError,
     DivergenceError,
     keep_freed_memory,
     load_checkpoint,
@@ -24,7 +25,7 @@ from flowrep.agent import (
 )
 from flowrep.agent.observation import compute_dtype, has_bf16
 from flowrep.config.schema import TrainConfig
-from flowrep.envs import begin_step, get_states, has_spare_cores, set_states
+from flowrep.envs import WorkerError, begin_step, get_states, has_spare_cores, set_states
 from flowrep.envs.workers import sheltered
 from flowrep.experiment import build
 from flowrep.experiment.evaluation import (
@@ -35,8 +36,7 @@ from flowrep.experiment.evaluation import (
 )
 from flowrep.experiment.outcomes import OUTCOMES, print_results
 from flowrep.experiment.run import RunFolder, check_origin, machine_of, origin_of
-from flowrep.progress import Stopwatch, progress_bar
-from flowrep.stop import StopRequest
+from flowrep.progress import StopRequest, Stopwatch, progress_bar
 
 
 @dataclass
@@ -78,6 +78,9 @@ class Runner:
         # TorchRL's storage starts multiprocessing's resource tracker, which a SIGHUP would end.
         with sheltered():
             self.agent = build.agent(config, self.env)
+        precision = getattr(config.algorithm, "precision", "fp32")
+        machine = machine_of(compute_dtype(precision, self.agent.device))
+        self.machine = machine | {"threads": config.threads}
         self.frames = 0  # of all envs, so far
         self.observation: TensorDictBase | None = None  # for the next action
         self.evaluation_pending = False  # whether a stop interrupted the last one
@@ -87,9 +90,7 @@ class Runner:
         """Trains until `total_frames` or until a stop is requested, and saves the last state."""
         total = self.config.total_frames
         self.folder.loggers.add_wandb(self.config.wandb, self.config.plain())
-        precision = getattr(self.config.algorithm, "precision", "fp32")
-        machine = machine_of(compute_dtype(precision, self.agent.device))
-        self.folder.note_machine(machine | {"threads": self.config.threads})
+        self.folder.note_machine(self.machine)
         log = Every(self.config.log_every_frames, self.frames)
         evaluate = Every(self.config.evaluation.every_frames, self.frames)
         save = Every(self.config.checkpoint_every_frames, self.frames)
@@ -191,6 +192,7 @@ class Runner:
             return False
         records = evaluation.records(**driver.origin(kind))
         self.folder.log_episodes(records, drives=kind == "final")
+        self.folder.note_machine(self.machine)
         if kind == "final":
             print_results([record.row() for record in records])
         return True
@@ -234,6 +236,7 @@ class Runner:
         self.folder.check_held()
         with self.clock("checkpoint"):
             save_checkpoint(self.folder.checkpoint_path, self.state())
+        self.folder.note_machine(self.machine)
 
     def load(self) -> None:
         """Continues from the checkpoint and drops the rows logged after it."""
@@ -242,14 +245,25 @@ class Runner:
             due = min(config.checkpoint_every_frames, config.total_frames)
             self.folder.start_again(first_save=due + config.num_envs - 1)
             return
-        state = load_checkpoint(path)
-        check_origin(state["origin"], origin_of(config.plain()), path)
         device = self.agent.device
         if getattr(config.algorithm, "precision", None) == "bf16" and not has_bf16(device):
             print(f"note: this run computes in bf16, which this machine's {device.type} emulates")
+        self.env.reset()
+        state = load_checkpoint(path)
+        try:
+            check_origin(state["origin"], origin_of(config.plain()), path)
+            self._restore(state)
+        except WorkerError:
+            raise
+        except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+            what = f"{path} does not hold the state of this run ({error!r})"
+            raise CheckpointError(f"{what}: restore the file, or start a new run") from error
+        self.folder.forget_after(self.frames)
+
+    def _restore(self, state: Mapping[str, Any]) -> None:
+        """Continues from a `state`, after the env's reset."""
         env = self.env
-        env.reset()
-        self.frames = state["frames"]
+        self.frames = int(state["frames"])
         self.evaluation_pending = state["evaluation_pending"]
         self.metrics.restore(state["metrics"])
         self.recent.restore(state["recent"])
@@ -260,7 +274,6 @@ class Runner:
         torch.set_rng_state(state["torch_rng"])
         if len(state["cuda_rng"]) == torch.cuda.device_count():
             torch.cuda.set_rng_state_all(state["cuda_rng"])
-        self.folder.forget_after(self.frames)
 
     def state(self) -> dict[str, Any]:
         """Returns all that the rest of the run depends on, as nested plain data and tensors."""

@@ -31,7 +31,7 @@ from flowrep.config.schema import TrainConfig, validated, validated_run
 from flowrep.experiment.outcomes import is_finished, success_of
 from flowrep.files import open_to_append
 from flowrep.options import ALGORITHMS
-from flowrep.stop import STOP_SIGNALS, StopRequest
+from flowrep.progress import STOP_SIGNALS, StopRequest
 from flowrep.usage import UsageError
 from flowrep.yaml_file import read_yaml
 

@@ -13,6 +13,7 @@ require("a report", "report", "hydra", "pydantic", "matplotlib", "scipy", "jinja
 
 from flowrep.config.cli import run_command
 from flowrep.config.schema import ReportConfig
+from flowrep.files import refuse_link, replace_text
 from flowrep.usage import UsageError
 
 
@@ -22,7 +23,7 @@ def report(config: ReportConfig) -> Path:
     from flowrep.report.runs import read_runs, without_repeats
 
     folders = list(map(Path, config.run))
-    output = Path(config.output or folders[0] / "report")
+    output = Path(config.output) if config.output else refuse_link(folders[0] / "report")
     readable, unreadable = read_runs(folders)
     runs, repeats = without_repeats(readable)
     warnings = [*unreadable, *repeats]
@@ -51,7 +52,7 @@ def report(config: ReportConfig) -> Path:
     for warning in drives.warnings:
         print(f"drives: {warning}")
     page = output / "index.html"
-    page.write_text(render_page(assembled, drives), encoding="utf-8")
+    replace_text(page, render_page(assembled, drives))
     print(f"page: {page}")
     return page
 

@@ -10,13 +10,13 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from flowrep.config.cli import line_for
 from flowrep.experiment.run import DRIVES, read_drives
+from flowrep.files import TableError
 from flowrep.report.figures import encoded, words
 from flowrep.report.runs import Run, groups_of, scenes_of
 from flowrep.report.sections import Report
 from flowrep.report.tables import listed
 from flowrep.scenes import SceneError, load_scene
 from flowrep.scenes.layout import Layout
-from flowrep.tables import TableError
 from flowrep.viz import OUTCOME_COLOURS
 from flowrep.viz.plan import Track, draw_plan
 

@@ -15,8 +15,8 @@ from flowrep.choices import SpeedMode
 from flowrep.experiment.lock import RunFolderError
 from flowrep.experiment.outcomes import EVALUATION_COLUMNS, OUTCOMES, EpisodeRecord
 from flowrep.experiment.run import RunFolder, flattened, origin_of
+from flowrep.files import TableError
 from flowrep.report.statistics import Array, Estimate, mean_share
-from flowrep.tables import TableError
 
 Cells = Mapping[str, Sequence[str]]
 """A table's text by column."""

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from matplotlib.figure import Figure
 
 from flowrep.config.cli import line_for
+from flowrep.files import refuse_link, replace_files
 from flowrep.report.figures import draw_bars, draw_curves, draw_rates, encoded, words
 from flowrep.report.runs import (
     COMPLEMENTARY_STACKS,
@@ -97,13 +98,15 @@ def write_files(report: Report, folder: Path) -> list[Path]:
     """Writes figures as PNG and PDF, tables as LaTeX and CSV; returns the sections' folders."""
     folders = [folder / section.folder for section in report.sections]
     for section, path in zip(report.sections, folders):
-        path.mkdir(exist_ok=True)
+        refuse_link(path).mkdir(exist_ok=True)
+        files: dict[str, bytes] = {}
         if section.figure:
             for kind in ("png", "pdf"):
-                (path / f"{section.name}.{kind}").write_bytes(encoded(section.figure, kind))
+                files[f"{section.name}.{kind}"] = encoded(section.figure, kind)
         for table in section.tables:
-            (path / f"{table.name}.tex").write_text(table.to_latex(), encoding="utf-8")
-            (path / f"{table.name}.csv").write_text(table.to_csv(), encoding="utf-8")
+            files[f"{table.name}.tex"] = table.to_latex().encode()
+            files[f"{table.name}.csv"] = table.to_csv().encode()
+        replace_files(path, files)
     return folders
 
 

@@ -11,11 +11,10 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from flowrep.diagnosis import Diagnosis, Examination
-from flowrep.progress import Stopwatch
+from flowrep.progress import StopRequest, Stopwatch
 from flowrep.sequences import factorization
 from flowrep.sequences.output import Output
 from flowrep.sequences.recording import Frame, Recording, Stream
-from flowrep.stop import StopRequest
 
 # Pairs are examined in consecutive groups, so that poses that lag or lead are noticed.
 EXAMINED_RUNS, EXAMINED_PAIRS = 4, 5

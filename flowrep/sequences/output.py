@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from flowrep import viz
 from flowrep.extras import require
+from flowrep.files import append_rows
 from flowrep.sequences.factorization import FactorizedFrame, factorize_pair
 from flowrep.sequences.files import FlowMap, write_flo, write_kitti_flow, write_picture
 from flowrep.sequences.recording import Frame, Pose, SequenceError
-from flowrep.tables import append_rows
 
 FLOW_NAMES = ("raw", "ego", "obj")
 _MOVING_SPREAD = 3.0

@@ -98,14 +98,10 @@ def write_video(path: str | Path, frames: Iterable[Image], *, fps: float) -> Non
     Raises:
         OSError: see `Video`; or there are no frames.
     """
-
-    def write(partial: Path) -> None:
-        with closing(Video(partial, fps=fps)) as video:
-            for frame in frames:
-                video.append(frame)
-
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    replace_file(Path(path), write)
+    with replace_file(Path(path)) as partial, closing(Video(partial, fps=fps)) as video:
+        for frame in frames:
+            video.append(frame)
 
 
 def is_playable(path: str | Path) -> bool:

@@ -17,7 +17,10 @@ def test_packed_runs_are_the_runs_of_the_folders(tmp_path):
     config = config_of("s_turn", "raw")
     metrics = [{"frames": 123456, "success": ""}, {"frames": 200000, "success": 0.25}]
     write_run(tmp_path / "runs" / "a", config, rows_of(config, "sct", fps=6.5), metrics)
-    machines = [{"commit": "abc", "precision": p, "cpu": "x"} for p in ("bfloat16", "float32")]
+    machines = [
+        {"commit": "abc", "precision": "bfloat16", "started": "1", "ended": "2"},
+        {"commit": "abc", "precision": "float32", "started": "3", "ended": "4"},
+    ]
     path = run_in(tmp_path / "runs", "b", seed=1) / "machine.json"
     path.write_text(json.dumps(machines))
     folders, _ = read_runs([tmp_path / "runs"])
@@ -29,7 +32,9 @@ def test_packed_runs_are_the_runs_of_the_folders(tmp_path):
         np.testing.assert_equal(first.episodes, second.episodes)
         np.testing.assert_equal(first.metrics, second.metrics)
     # it was resumed on another
-    assert packed[1].machine["precision"] == "bfloat16 | float32"
+    machine = packed[1].machine
+    assert machine["precision"] == "bfloat16 | float32"
+    assert (machine["started"], machine["ended"]) == ("1", "4")
 
 
 def test_a_study_is_written_once_and_the_same_runs_give_the_same_bytes(tmp_path):

@@ -14,7 +14,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from flowrep.envs import WorkerError, WorkerVectorEnv, workers
-from flowrep.stop import StopRequest
+from flowrep.progress import StopRequest
 from tests.comparing import differing
 
 pytestmark = pytest.mark.slow

@@ -15,7 +15,7 @@ from flowrep.experiment.outcomes import (
     wilson_interval,
 )
 from flowrep.experiment.run import RunFolder
-from flowrep.tables import read_rows
+from flowrep.files import read_rows
 from tests.experiment.test_run import episode
 
 

@@ -11,7 +11,9 @@ import shutil
 import subprocess
 import sys
 import time
+from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,7 +24,7 @@ from flowrep.agent import CheckpointError
 from flowrep.experiment.lock import FolderInUseError, RunFolderError
 from flowrep.experiment.outcomes import EVALUATION_COLUMNS, EpisodeRecord
 from flowrep.experiment.run import RunFolder, check_origin, machine_of, origin_of, read_drives
-from flowrep.tables import TableError, write_rows
+from flowrep.files import TableError, write_rows
 from tests.config.composing import composed, plain
 
 
@@ -352,15 +354,23 @@ def test_a_damaged_config_is_named(tmp_path, text):
         RunFolder.existing(tmp_path).read_config()
 
 
-def test_what_a_run_is_computed_with_is_noted_once_for_each_machine(tmp_path):
+def test_a_run_notes_each_machine_with_its_first_start_and_its_last_end(tmp_path, monkeypatch):
     run, here = RunFolder(tmp_path), machine_of(torch.bfloat16)
     assert here["precision"] == "bfloat16"
     assert here["cpu"]
     assert here["commit"] or here["flowrep"]
-    for machine in (here, here, here | {"cpu": "another"}, here):
-        run.note_machine(machine)
+    clock = iter(range(10, 14))
+    with monkeypatch.context() as patched:
+        now = SimpleNamespace(now=lambda _: datetime(2026, 1, 1, next(clock), tzinfo=UTC))
+        patched.setattr("flowrep.experiment.run.datetime", now)
+        for machine in (here, here, here | {"cpu": "another"}, here):
+            run.note_machine(machine)
     noted = json.loads((tmp_path / "machine.json").read_text())
+    times = [tuple(each.pop(k)[11:] for k in ("started", "ended")) for each in noted]
     assert noted == [here, here | {"cpu": "another"}, here]
+    assert times == [
+        ("10:00:00+00:00", "11:00:00+00:00"), *[(f"{h}:00:00+00:00",) * 2 for h in (12, 13)]
+    ]  # fmt: skip
 
 
 def test_a_clone_on_a_machine_without_git_has_no_commit(tmp_path, monkeypatch):
@@ -434,7 +444,15 @@ def test_an_evaluation_run_again_leaves_the_table_of_one_that_was_never_stopped(
 HEADER = ",".join(EVALUATION_COLUMNS)
 ROW = ",".join(cells(episode(1)).values())
 DAMAGED = {
-    "frames that are no number": f"{HEADER}\n{','.join(cells(episode(1), frames='1O').values())}\n",
+    **{
+        f"{cell}": f"{HEADER}\n{','.join(cells(episode(1), **cell).values())}\n"
+        for cell in (
+            {"frames": "1O"},
+            {"frames": 26 * "9"},
+            {"length": 401 * "9"},
+            {"fps": "1e999"},
+        )
+    },
     "semicolons": f"{HEADER}\n{ROW}\n".replace(",", ";"),
     "a column less": f"{HEADER.replace(',hit', '')}\n{ROW.rpartition(',')[0]}\n",
     "a short row": f"{HEADER}\n{ROW}\n{ROW.rpartition(',')[0]}\n",
@@ -518,6 +536,14 @@ def test_damaged_drives_cost_no_episode_and_are_set_aside(tmp_path, capsys, dama
     assert aside.name in said
 
 
+def test_drives_that_would_fill_the_memory_are_damaged(tmp_path, monkeypatch):
+    run = RunFolder(tmp_path)
+    run.log_episodes([episode(1)], drives=True)
+    monkeypatch.setattr("flowrep.experiment.run._MOST_BYTES", 1_000)
+    with pytest.raises(TableError, match=r"drives\.npz"):
+        read_drives(run.drives_path)
+
+
 def test_whole_drives_are_added_to(tmp_path):
     run = RunFolder(tmp_path)
     run.log_episodes([episode(1)], drives=True)
@@ -540,11 +566,12 @@ def test_episodes_are_saved_before_their_drives(tmp_path, monkeypatch):
     assert len(run.read_episodes()) == 1
 
 
-@pytest.mark.parametrize("text", ["[{", "", "{}", "null", "\x00", "[" * 20_000])
+@pytest.mark.parametrize("text", ["[{", "", "{}", "[null]", "\x00", "[" * 20_000])
 def test_a_damaged_list_of_machines_is_set_aside(tmp_path, capsys, text):
     (tmp_path / "machine.json").write_text(text)
     RunFolder(tmp_path).note_machine({"cpu": "x"})
-    assert json.loads((tmp_path / "machine.json").read_text()) == [{"cpu": "x"}]
+    (noted,) = json.loads((tmp_path / "machine.json").read_text())
+    assert noted["cpu"] == "x"
     assert str(tmp_path / "machine.json") in capsys.readouterr().err
     assert len(list(tmp_path.iterdir())) == 2
 

@@ -9,13 +9,13 @@ import torch
 from tensordict import TensorDict
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from flowrep.agent import CheckpointError, DivergenceError
+from flowrep.agent import CheckpointError, DivergenceError, load_checkpoint, save_checkpoint
 from flowrep.config import group_choices
 from flowrep.experiment import build
 from flowrep.experiment.lock import RunFolderError
 from flowrep.experiment.run import RunFolder
 from flowrep.experiment.runner import Every, Means, RecentEpisodes, Runner, progress_text
-from flowrep.stop import StopRequest
+from flowrep.progress import StopRequest
 from flowrep.train import finish as finish_run
 from flowrep.train import resumed
 from flowrep.usage import UsageError
@@ -266,6 +266,18 @@ def test_a_resumed_run_equals_the_uninterrupted_one_bit_for_bit(tmp_path, algori
     assert all(any(row[name] != "nan" for row in rows) for name in rows[0])
     described = explained()
     assert {*rows[0], *CLOCK} == described["Every run"] | described[f"algorithm={algorithm}"]
+
+
+@pytest.mark.slow
+def test_a_checkpoint_whose_state_has_another_shape_is_one_error(tmp_path):
+    runner = trained(new_run(tmp_path))
+    path, runner = runner.folder.checkpoint_path, new_run(tmp_path)
+    whole = load_checkpoint(path)
+    for part in ({"origin": 3}, {"frames": None}, {"agent": []}, {"memory": {}}, {"env": [1]}):
+        save_checkpoint(path, whole | part)
+        with pytest.raises(CheckpointError, match=r"latest\.safetensors"):
+            runner.load()
+    runner.close()
 
 
 @pytest.mark.slow

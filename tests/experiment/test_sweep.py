@@ -18,7 +18,7 @@ from flowrep.config import CONF_DIR, cli, group_choices
 from flowrep.config.schema import TrainConfig
 from flowrep.experiment import sweep
 from flowrep.experiment.outcomes import EVALUATION_COLUMNS, is_finished
-from flowrep.tables import TableError, read_rows
+from flowrep.files import TableError, read_rows
 from flowrep.usage import UsageError
 from tests.config.composing import composed, plain
 

@@ -3,7 +3,7 @@
 import yaml
 
 from flowrep.experiment.outcomes import EVALUATION_COLUMNS
-from flowrep.tables import write_rows
+from flowrep.files import write_rows
 
 EPISODES = 8
 

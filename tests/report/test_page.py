@@ -1,5 +1,6 @@
 """A whole report: the command, its page in a browser, and the drives and films that it shows."""
 
+import os
 import re
 import shlex
 import sys
@@ -116,6 +117,22 @@ def test_what_was_found_is_printed_and_where_it_was_written(tmp_path, monkeypatc
 
 
 # Drives and films.
+
+
+def test_a_link_in_a_runs_folder_leads_a_report_nowhere(tmp_path, victim, monkeypatch):
+    run, before = run_in(tmp_path, "run"), victim.read_text()
+    (run / "report").mkdir()
+    (run / "report" / "index.html").symlink_to(victim)
+    monkeypatch.setattr("sys.argv", ["report", f"run={run}"])
+    main()
+    assert "<html" in (run / "report" / "index.html").read_text()
+    section = run / "report" / "success"
+    section.rename(tmp_path / "moved")
+    section.symlink_to(victim.parent)
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    assert (victim.read_text(), os.listdir(victim.parent)) == (before, ["victim"])
 
 
 def write_drives(folder, **changes):
