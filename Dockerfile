@@ -20,7 +20,7 @@ WORKDIR /flowrep
 COPY --chown=flowrep pyproject.toml Makefile README.md LICENSE ./
 COPY --chown=flowrep flowrep/__init__.py flowrep/__init__.py
 COPY --chown=flowrep conf conf
-RUN make develop PYTHON=python3.11
+RUN make develop PYTHON=python3.11 BACKEND=cpu
 
 COPY --chown=flowrep . .
 # Copied files are newer than the environment that was made for them.

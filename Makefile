@@ -3,9 +3,10 @@
 # Override with `make train PYTHON=...`.
 PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v python3.13 || command -v python3.14 || command -v python3)
 # Installed before all that depends on torch, so that pip doesn't pick a build of its own choice.
-# On Linux the default is CUDA's build, 6.6 GB with all that .venv holds. For the CPU's, 2.2 GB,
-# give the index that pytorch.org/get-started/locally prints for it: make install INDEX=...
+# On Linux the default is CUDA's build, 6.6 GB with all that .venv holds; BACKEND=cpu has uv choose
+# the CPU's, 2.2 GB. INDEX names another index, such as a mirror.
 TORCH ?= torch==2.13.0
+BACKEND ?=
 INDEX ?=
 ARGS ?=
 
@@ -27,7 +28,7 @@ check-python:
 $(INSTALLED): pyproject.toml | check-python
 	@echo "Installing PyTorch into $(ENV) (a minute or two) ..."
 	@$(PYTHON) -m venv $(ENV)
-	@$(PIP) "$(TORCH)" $(if $(INDEX),--index-url $(INDEX))
+	@$(if $(BACKEND),$(PIP) uv && $(BIN)/uv pip install --quiet --python $(ENV) --torch-backend=$(BACKEND),$(PIP) $(if $(INDEX),--index-url $(INDEX))) "$(TORCH)"
 	@echo "Installing flowrep and what training, reports and recordings need ..."
 	@$(PIP) --editable ".[train,report,factorize]"
 	@touch $@
@@ -37,7 +38,7 @@ $(DEVELOPED): $(INSTALLED)
 	@$(PIP) --editable ".[dev]"
 	@touch $@
 
-install: $(INSTALLED)  ## Create .venv and install flowrep into it; without a GPU: make install INDEX=<PyTorch's CPU index>
+install: $(INSTALLED)  ## Create .venv and install flowrep into it; without a GPU: make install BACKEND=cpu
 
 develop: $(DEVELOPED)  ## Install what tests, lint and types need, too
 

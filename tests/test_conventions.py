@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from flowrep.geometry import project, relative_motion, unproject
+from flowrep.geometry import ego_flow, project, relative_motion, unproject
 
 ROOT = Path(__file__).resolve().parents[1]
 LINES = [
@@ -84,3 +84,20 @@ def test_a_wide_world_costs_no_precision():
     assert prev_from_curr.dtype == torch.float32
     expected = torch.tensor([0.83, 0.0, 0.0])
     torch.testing.assert_close(prev_from_curr[:3, 3], expected, rtol=0, atol=1e-7)
+
+
+def test_ego_flow_is_that_of_dungeon_maps_which_the_paper_used():
+    # github.com/Ending2015a/dungeon_maps: pixels at whole numbers, the bottom row is 0, centre
+    # (W/2, H/2), x right, y up, z forward, yaw to the left. On 4 x 2 pixels with f = (2, 4), the
+    # camera turned by a yaw of sin 0.6, cos 0.8 and moved by x = 0.5, z = 1; all depths are 4.
+    # Column 3 of the top row, 1: (2, 0, 4) was at (0.8 * 2 - 0.6 * 4 + 0.5, 0, 0.6 * 2 + 0.8 * 4
+    # + 1) = (-0.3, 0, 5.4), pixel (2 - 0.6 / 5.4, 1). Column 0 of the bottom row: (-4, -1, 4) was
+    # at (-5.1, -1, 1.8), pixel (2 - 10.2 / 1.8, 1 - 4 / 1.8). In flowrep rows count downwards.
+    # With yaw to the right, the first would be 3 - 5.
+    K = camera(fx=2.0, cx=4 / 2 + 0.5, fy=4.0, cy=2 / 2 - 0.5)
+    prev_from_curr = torch.eye(4)
+    prev_from_curr[0, [0, 2, 3]] = torch.tensor([0.8, -0.6, 0.5])
+    prev_from_curr[2, [0, 2, 3]] = torch.tensor([0.6, 0.8, 1.0])
+    flow, _ = ego_flow(torch.full((1, 2, 4), 4.0), K, prev_from_curr)
+    torch.testing.assert_close(flow[:, 0, 3], torch.tensor([3 - 2 + 0.6 / 5.4, 0.0]))
+    torch.testing.assert_close(flow[:, 1, 0], torch.tensor([0 - 2 + 10.2 / 1.8, 1 - 4 / 1.8]))

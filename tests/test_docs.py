@@ -5,7 +5,6 @@ import pkgutil
 import re
 import shlex
 import shutil
-from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -18,7 +17,6 @@ from torchrl.envs import TransformedEnv, check_env_specs
 
 from docs import docstrings
 from flowrep import transforms
-from flowrep.config import config_groups, group_choices
 from flowrep.config.cli import as_typed
 from flowrep.config.schema import (
     EvaluateConfig,
@@ -32,7 +30,6 @@ from flowrep.transforms import RawFlow
 from flowrep.transforms.hydra_configs import CONFIGS
 from tests.config.composing import plain
 from tests.running import run_python
-from tests.test_architecture import flowrep_imports
 from tests.transforms.fake_env import HEIGHT, WIDTH, FakeSensorEnv
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -52,19 +49,6 @@ def navigation(entries):
 
 def python_of(page):
     return "\n".join(re.findall(r"```python\n(.*?)```", page.read_text("utf-8"), re.DOTALL))
-
-
-def test_the_page_of_configs_lists_every_group_and_choice():
-    rows = re.findall(r"^\| `(\w+)` \|([^|]*)\|", (DOCS / "configs.md").read_text("utf-8"), re.M)
-    listed = {group: sorted(re.findall(r"`(\w+)`", choices)) for group, choices in rows}
-    assert listed == {group: group_choices(group) for group in config_groups()}
-
-
-def test_the_list_of_examples_is_complete():
-    folder = DOCS.parent / "examples"
-    names = re.findall(r"^\| `([\w.]+)` \|", (folder / "README.md").read_text("utf-8"), re.M)
-    there = [path.name for path in folder.iterdir() if not path.name.startswith(("_", "README"))]
-    assert sorted(names) == sorted(there)
 
 
 def test_every_transform_has_its_page():
@@ -90,37 +74,6 @@ def test_the_names_in_the_architecture_lead_somewhere():
     assert len(names) > 20
     for name in names:
         pkgutil.resolve_name(f"flowrep.{name}")
-
-
-def test_the_architecture_draws_what_imports_what():
-    svg = (DOCS / "images" / "architecture.svg").read_text("utf-8")
-    sides = r'<rect x="(\d+)" y="(\d+)" width="(\d+)" height="(\d+)" .*\n<text .*?>(.*)</text>'
-    boxes = {name: tuple(map(int, at)) for *at, name in re.findall(sides, svg) if at[0] != "0"}
-    owner = {part: name for name in boxes for part in name.split(" · ")}
-    packages = {path.parent.name for path in PACKAGE.glob("*/__init__.py")} - {"conf"}
-    assert owner.keys() == packages | {"train", "evaluate", "export", "view", "factorize"}
-
-    def box_at(x, y):
-        for name, (left, top, width, height) in boxes.items():
-            if left <= x <= left + width and top <= y <= top + height:
-                return name
-
-    arrows = set()
-    for line in re.findall(r'<path d="(M[\d ML]+)"/>', svg):
-        points = [tuple(map(int, point.split())) for point in re.split(r" ?[ML]", line)[1:]]
-        arrows.add((box_at(*points[0]), box_at(*points[-1])))
-    imports_of = {name: set() for name in boxes}
-    for path in PACKAGE.rglob("*.py"):
-        part = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
-        if part in owner:
-            taken = {owner[each] for each in flowrep_imports(path) if each in owner}
-            imports_of[owner[part]] |= taken - {owner[part]}
-    assert arrows <= {(name, other) for name, others in imports_of.items() for other in others}
-    reached = {name: {other for one, other in arrows if one == name} for name in boxes}
-    for name in TopologicalSorter(reached).static_order():  # what a package imports comes first
-        reached[name] = reached[name].union(*(reached[other] for other in reached[name]))
-    missing = {name: others - reached[name] for name, others in imports_of.items()}
-    assert not any(missing.values()), missing
 
 
 def test_the_navigation_names_every_page_once():

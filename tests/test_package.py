@@ -62,7 +62,7 @@ def test_the_wheel_has_the_configs_and_nothing_beside_the_package(built):
     with zipfile.ZipFile(built[1]) as wheel:
         names = set(wheel.namelist())
     configs = {f"flowrep/{path.relative_to(ROOT)}" for path in ROOT.glob("conf/**/*.*ml")}
-    assert configs <= names
+    assert configs | {"flowrep/py.typed"} <= names
     assert {name.split("/")[0] for name in names} == {"flowrep", f"flowrep_rl-{VERSION}.dist-info"}
     assert not [name for name in names if name.endswith((".pyc", ".png"))]
 

@@ -36,14 +36,6 @@ def test_links_of_the_readme_lead_somewhere():
     assert [x for x in links if "://" not in x and not (README.parent / x).exists()] == []
 
 
-def test_the_gallery_shows_every_scene_and_make_gallery_makes_it():
-    gallery = (README.parent / "docs" / "gallery.md").read_text("utf-8")
-    (listed,) = re.findall(r"^SCENES = (.+)$", (README.parent / "Makefile").read_text(), re.M)
-    scenes = {path.stem for path in (README.parent / "conf" / "scene").glob("*.yaml")}
-    assert set(listed.split()) == scenes
-    assert all(f"{kind}_{scene}.png" in gallery for kind in ("gallery", "plan") for scene in scenes)
-
-
 def test_the_readmes_agents_are_those_of_the_results_and_of_the_trained_agents_card():
     rows = README.read_text(encoding="utf-8").split("| pedestrians |")[1].splitlines()[2:5]
     taught, demo = zip(*(line.split("|")[2:4] for line in rows))
@@ -53,19 +45,6 @@ def test_the_readmes_agents_are_those_of_the_results_and_of_the_trained_agents_c
     card = (README.parent / "flowrep" / "pretrained" / "README.md").read_text(encoding="utf-8")
     (row,) = re.findall(r"^\| Straight Road \|.*", card, re.MULTILINE)
     assert [cell.split()[0] for cell in demo] == [f"{float(c):.0f}" for c in row.split("|")[2:5]]
-
-
-def test_the_readmes_count_of_verdicts_is_that_of_the_results():
-    text = README.read_text(encoding="utf-8")
-    results = (README.parent / "paper" / "results.md").read_text(encoding="utf-8")
-    verdicts = re.findall(r"^\|[1-8]\|.*?\*\*(\w+)[^|]*\*\*\|", results, re.MULTILINE)
-    counted = [verdicts.count(word) for word in ("holds", "contradicted", "not")]
-    assert counted == [2, 1, 5]
-    assert "two hold, one is contradicted, three are not seen and two are undecided" in text
-    by_recipe = results.split("### Verdicts by recipe")[1].split("###")[0]
-    newest = re.findall(r"^\|[1-8]  .*\*\*(\w+)[^*]*\*\*\|$", by_recipe, re.MULTILINE)
-    assert (newest.count("holds"), newest.count("contradicted"), len(newest)) == (4, 0, 8)
-    assert "four hold and none is contradicted" in text
 
 
 def test_every_page_and_make_install_the_same_torch():

@@ -71,7 +71,7 @@ def plans_and_films_of(runs: Sequence[Run], *, trajectories: int, videos: int) -
             else:
                 ends = Counter(track.outcome.replace("_", " ") for track in tracks)
                 ended = ", ".join(f"{number} {outcome}" for outcome, number in ends.items())
-                uri = data_uri("image/png", encoded(draw_plan(layout, tracks), "png", 100))
+                uri = data_uri("image/png", encoded(draw_plan(layout, tracks), "png", 150))
                 plan = EmbeddedPicture(title, f"drives: {ended}", uri)
                 drives.plans.setdefault(scene, []).append(plan)
         elif trajectories:

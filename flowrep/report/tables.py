@@ -88,9 +88,15 @@ def percent(estimate: Estimate, digits: int = 0) -> str:
 
 
 def points(estimate: Estimate) -> str:
-    """Returns a difference and its interval, if known, in points: "+12 [−3, +20]"."""
+    """Returns a difference and its interval, if known, in points: "+12 [−3, +20]".
+
+    Shares differ by 100 points at most; an interval of ±100 or more, as that of two runs may be,
+    says nothing.
+    """
     value, low, high = estimate
-    interval = "" if np.isnan(low) else f" [{signed(low)}, {signed(high)}]"
+    if high - low >= 2:
+        return f"{signed(value)} [too few runs]"
+    interval = "" if np.isnan(low) else f" [{signed(max(low, -1))}, {signed(min(high, 1))}]"
     return signed(value) + interval
 
 

@@ -63,7 +63,7 @@ def test_p_is_corrected_for_the_comparisons_of_its_block(tmp_path):
     low, high = rows_in(sections_of(tmp_path)[0]["flow_composition"].tables[1])
     assert low[4] == high[4] == "0.019"  # Welch: 0.625 / 0.0884 = 7.07, 2 degrees
     assert low[5] == high[5] == "0.039"
-    assert low[2] == "+62 [+24, +101]"  # t = 4.303
+    assert low[2] == "+62 [+24, +100]"  # t = 4.303
     assert (low[3], low[6]) == ("lower" if low[0].startswith("ego") else "higher", "100")
 
 
@@ -220,6 +220,7 @@ def test_a_learning_curve_is_of_the_speed_and_frame_rate_of_training(tmp_path):
 def test_numbers_are_told_with_their_intervals():
     assert percent(Estimate(0.854, 0.791, 0.901)) == "85 [79–90]"
     assert points(Estimate(0.123, -0.031, 0.2)) == "+12 [−3, +20]"
+    assert points(Estimate(0.25, -2.93, 3.43)) == "+25 [too few runs]"
     assert percent(Estimate(0.854, math.nan, math.nan)) == "85"
     assert points(Estimate(-0.123, math.nan, math.nan)) == "−12"
     assert ratio(Estimate(0.2, 0.1, 1.0)) == "0.250 [0.111–∞]"
