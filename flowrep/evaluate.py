@@ -18,7 +18,7 @@ from flowrep.extras import require
 require("evaluation", "train", "hydra", "pydantic", module=__name__)
 
 from flowrep.config.cli import EXIT_USAGE, folder_name, is_a_mistake, print_error, run_command
-from flowrep.config.schema import EvaluateConfig, check_policy
+from flowrep.config.schema import EvaluateConfig
 from flowrep.progress import StopRequest
 from flowrep.usage import UsageError
 
@@ -74,10 +74,13 @@ def candidates_of(config: EvaluateConfig) -> list[Candidate]:
     for path in config.run or []:
         for run in RunFolder.all_in(path):
             runs.setdefault(run.path.resolve(), run)
-    for name in config.other_policies:
-        check_policy(name)
 
     from flowrep.experiment.agents import Agent
+    from flowrep.experiment.policies import ForeignPolicy, SavedPolicy, policy_of
+
+    for name in config.other_policies:
+        if not isinstance(policy_of(name), ForeignPolicy | SavedPolicy):
+            raise UsageError(f"policy={name}: evaluate a run by run=, a baseline by baselines=")
 
     machine = config.model_dump(include={"device", "num_envs", "num_workers"})
     if not config.other_policies:

@@ -20,7 +20,7 @@ require("viewing", "train", "hydra", "pydantic", "matplotlib", "imageio_ffmpeg",
 from hydra.core.hydra_config import HydraConfig
 
 from flowrep.config.cli import folder_name, run_command
-from flowrep.config.schema import ViewConfig, check_policy, policy_kind
+from flowrep.config.schema import ViewConfig
 from flowrep.files import replace_files, write_rows
 from flowrep.progress import progress_bar
 from flowrep.usage import UsageError
@@ -39,8 +39,6 @@ FILES = ("sheet.png", "episode.mp4", "plan.png", "episodes.csv")
 
 def run(config: ViewConfig) -> None:
     """Writes pictures, a film and tables of the scene."""
-    check_policy(config.policy)
-
     from flowrep.experiment.film import Film
 
     keys = [text.partition("=")[0].lstrip("+") for text in HydraConfig.get().overrides.task]
@@ -54,8 +52,9 @@ def run(config: ViewConfig) -> None:
 
 def keeps_scene(config: ViewConfig, is_scene_given: bool) -> bool:
     """Returns whether a trained agent drives in the scene of its training."""
-    is_trained = policy_kind(config.policy) in ("run", "saved") and config.policy != "pretrained"
-    return is_trained and not is_scene_given
+    from flowrep.experiment.policies import policy_of
+
+    return policy_of(config.policy).has_scene and not is_scene_given
 
 
 def agent_of(config: ViewConfig, is_scene_given: bool) -> Agent:

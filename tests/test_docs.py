@@ -20,7 +20,6 @@ from flowrep import transforms
 from flowrep.config.cli import as_typed
 from flowrep.config.schema import (
     EvaluateConfig,
-    ExportConfig,
     FactorizeConfig,
     ReportConfig,
     TrainConfig,
@@ -193,7 +192,7 @@ def test_commands_quote_their_lists_for_every_shell():
 
 COMMANDS = {
     "train": TrainConfig, "evaluate": EvaluateConfig, "view": ViewConfig, "report": ReportConfig,
-    "export": ExportConfig, "factorize": FactorizeConfig,
+    "factorize": FactorizeConfig,
 }  # fmt: skip
 
 

@@ -1,17 +1,18 @@
 """`flowrep.evaluate` on agents of a few frames: what it runs, what it refuses, what it keeps."""
 
-import json
 import os
 import signal
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 pytest.importorskip("pybullet", reason="agents are evaluated in the simulated street")
 
+from examples import export_agent
 from flowrep.agent import CheckpointError
 from flowrep.config.schema import EvaluateConfig, validated
 from flowrep.envs import WorkerError, workers
@@ -19,8 +20,7 @@ from flowrep.evaluate import candidates_of
 from flowrep.evaluate import run as evaluate
 from flowrep.experiment.agents import Agent
 from flowrep.experiment.evaluation import BaselinePolicy, PairedEvaluation
-from flowrep.experiment.exported import export
-from flowrep.experiment.external import PolicyError
+from flowrep.experiment.policies import PolicyError
 from flowrep.experiment.run import RunFolder
 from flowrep.experiment.runner import Runner
 from flowrep.files import TableError, read_rows
@@ -342,30 +342,23 @@ def test_an_agent_in_a_file_drives_as_in_its_run(untouched, tmp_path):
     assert episodes(rows, name) == mine
 
 
-def test_an_exported_agent_drives_as_it_did_in_flowrep(tmp_path):
-    given = ["algorithm.precision=fp32", "representations=[ego,obj]"]
-    run = saved(tmp_path / "run", *given)
+def test_an_agent_that_the_example_exports_drives_as_it_did_in_flowrep(tmp_path):
+    run = saved(tmp_path / "run", "algorithm.precision=fp32", "representations=[ego,obj]")
     evaluate(asked(f"run={run.path}", "episodes=3"))
     mine = episodes(run.read_episodes(), "greedy")
-    folder = run.path / "export"
-    export(Agent.load(run.path, precision="fp32", device="cpu"), folder)
-    card = json.loads((folder / "agent.json").read_text())
-    assert [each["name"] for each in card["maps"]] == ["ego", "obj"]
+    program = str(tmp_path / "agent.pt2")
+    names = export_agent.export(run.path, program)
     camera = run.read_config()["scene"]["camera"]
     same = [f"scene.camera.{key}={camera[key]}" for key in ("height_px", "width_px", "fov_deg")]
-    program = f"{folder}/agent.pt2"
-    with pytest.raises(PolicyError, match=r"scene\.camera\.height_px"):
-        own(program, tmp_path / "refused", *given[1:])
-    for name, maps in ((f"{folder}/load_agent.py:make", "[ego,obj]"), (program, "[obj,ego]")):
-        asked_for = [f"representations={maps}", *same, "episodes=3", SHORT]
-        rows = own(name, tmp_path / maps[1:4], *asked_for)
-        driven = [(row["episode_seed"], row["outcome"], row["return"]) for row in rows]
-        assert driven == [(row["episode_seed"], row["outcome"], row["return"]) for row in mine]
-    by_default = {"ego": {}, "obj": None}  # the options of conf, which the agent had
-    scene = run.config().scene
-    agent = Agent.load(program, scene=scene, representations=by_default, device="cpu")
-    (first,) = agent.evaluate(1)
-    assert (str(first.episode_seed), first.outcome) == driven[0][:2]
+    maps = f"representations=[{','.join(names)}]"
+    rows = own(program, tmp_path / "out", maps, *same, "episodes=3", SHORT)
+    driven = [(row["episode_seed"], row["outcome"], row["return"]) for row in rows]
+    assert driven == [(row["episode_seed"], row["outcome"], row["return"]) for row in mine]
+    agent, act = Agent.load(run.path, precision="fp32", device="cpu"), export_agent.load(program)
+    with closing(agent.make_env(num_envs=3, num_workers=0)) as env:
+        seen = env.rollout(4)[:, -1]
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert torch.equal(act(seen), agent.policy(seen)["action"])
 
 
 def test_a_policy_without_actions_leaves_a_line_and_no_row(tmp_path, capsys):

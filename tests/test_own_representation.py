@@ -9,7 +9,7 @@ import torch
 
 pytest.importorskip("pybullet", reason="the environments are built with it")
 
-from flowrep.config.schema import EvaluateConfig, ExportConfig, ViewConfig, validated
+from flowrep.config.schema import EvaluateConfig, ViewConfig, validated
 from flowrep.experiment import build
 from flowrep.experiment.agents import Agent
 from flowrep.experiment.film import Film
@@ -101,7 +101,6 @@ def test_a_stored_run_names_no_code(config, folder, typed):
     for use in (
         lambda: stored_config(run, *typed),
         lambda: Agent.load(run.path, trusted=command(ViewConfig, "view", *typed).trusted),
-        lambda: run.config(command(ExportConfig, "export", "run=x", *typed).trusted),
         lambda: run.config(command(EvaluateConfig, "evaluate", "run=x", *typed).trusted),
     ):
         with pytest.raises(UsageError, match=re.escape(TYPED)):
@@ -113,12 +112,8 @@ def test_what_the_user_typed_is_used(config, folder):
     run = RunFolder(folder / "run")
     run.write_config(config.plain())
     assert stored_config(run, TYPED).representations == config.representations
-    for model, line in (
-        (ExportConfig, ["export", "run=x"]),
-        (EvaluateConfig, ["evaluate", "run=x"]),
-    ):
-        asked = command(model, *line, TYPED)
-        assert run.config(asked.trusted).representations == config.representations
+    asked = command(EvaluateConfig, "evaluate", "run=x", TYPED)
+    assert run.config(asked.trusted).representations == config.representations
     target = TYPED.partition("=")[2]
     assert run.config(target).representations == config.representations  # one without a list
     with pytest.raises(UsageError, match="representations="):

@@ -15,14 +15,14 @@ from safetensors.torch import save_file
 
 pytest.importorskip("pybullet", reason="the commands build the simulated street")
 
+
 from flowrep.agent import CheckpointError, checkpoint, load_checkpoint, save_checkpoint
-from flowrep.config.schema import EvaluateConfig, ExportConfig, ViewConfig, validated
+from flowrep.config.schema import EvaluateConfig, ViewConfig, validated
 from flowrep.evaluate import candidates_of
-from flowrep.experiment import agents, film, sweep
+from flowrep.experiment import film, policies, sweep
 from flowrep.experiment.agents import Agent
 from flowrep.experiment.lock import RunFolderError
 from flowrep.experiment.run import RunFolder
-from flowrep.export import run as export
 from flowrep.scenes import SceneError, load_scene
 from flowrep.train import resumed
 from flowrep.usage import UsageError
@@ -64,10 +64,6 @@ def view(run, *typed):
     return agent_of(validated(ViewConfig, plain("view", f"policy={run.path}", *typed)), False)
 
 
-def exported(run, *typed):
-    return export(validated(ExportConfig, plain("export", f"run={run.path}", *typed)))
-
-
 def repeated_sweep(run, *typed):
     asked = composed("debug=smoke", "device=cpu", *typed)
     return sweep.attempted(run.path, asked, [], lambda: True)
@@ -79,7 +75,7 @@ def packed(run, *_):
     return Agent.load(run.path / "x.safetensors")
 
 
-USES = [resume, evaluate, view, exported, repeated_sweep, packed]
+USES = [resume, evaluate, view, repeated_sweep, packed]
 
 
 @pytest.mark.parametrize("use", USES)
@@ -103,7 +99,7 @@ def test_another_name_on_the_command_line_is_not_the_stored_one(stranger, use):
 
 def test_what_the_user_typed_is_imported(stranger):
     run = stranger()
-    for use in (evaluate, view, exported):
+    for use in (evaluate, view):
         # past the config: there is no checkpoint
         with pytest.raises(CheckpointError, match=r"latest\.safetensors"):
             use(run, "algorithm._target_=evil.A")
@@ -259,7 +255,7 @@ def test_a_checkpoint_with_other_contents_is_one_error(tmp_path, metadata):
 
 @pytest.mark.parametrize("name", ["../x", "/tmp/x", "."])
 def test_a_pretrained_agent_is_one_of_the_files_that_come_with_flowrep(tmp_path, monkeypatch, name):
-    monkeypatch.setattr(agents, "PRETRAINED", tmp_path / "folder")
+    monkeypatch.setattr(policies, "PRETRAINED", tmp_path / "folder")
     (tmp_path / "folder").mkdir()
     (tmp_path / "x.safetensors").write_text("")
     with pytest.raises(SceneError, match="name: "):  # names are letters, digits, _ and -

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Collection, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, Union, get_args, get_type_hints
 
 from pydantic import (
@@ -300,23 +299,14 @@ class EvaluateConfig(Command):
     @model_validator(mode="after")
     def _fits_together(self) -> EvaluateConfig:
         others = self.other_policies
-        kinds = {name: policy_kind(name) for name in others}
-        for name, kind in kinds.items():
-            if kind not in ("saved", "external"):
-                raise ValueError(
-                    f"policy={name}: should be greedy, sampled, pretrained, path.py:make, "
-                    "package.module:make, path.pt2 or path.safetensors"
-                )
         if others and len(others) < len(self.policy):
             raise ValueError("policy: greedy and sampled are of runs; evaluate others separately")
         if others and self.run is not None:
             raise ValueError(f"run= and policy={others[0]} can't be combined: give one of them")
         if not others and self.run is None:
             raise ValueError("run needs a value: run=<a run's or a sweep's folder>")
-        for name, kind in kinds.items():
-            for key in ("scene",) if kind == "saved" else ("scene", "representations"):
-                if getattr(self, key) is None:
-                    raise ValueError(f"{key} needs a value for policy={name}")
+        if others and self.scene is None:
+            raise ValueError(f"scene needs a value for policy={others[0]}")
         maps = (self.representations or {}).values()
         for key in ("representations", "flow", "motion", "noise", "output"):
             if key == "representations" and all(options.keys() == {"_target_"} for options in maps):
@@ -324,15 +314,6 @@ class EvaluateConfig(Command):
             if not others and getattr(self, key) is not None:
                 raise ValueError(f"{key}= can't be combined with run=: a run has its own {key}")
         return self
-
-
-class ExportConfig(Command):
-    """The whole config of `flowrep.export`."""
-
-    run: Text
-    representations: Stack | None = None
-    algorithm: Trusted
-    output: Text | None
 
 
 class ViewConfig(Command):
@@ -442,38 +423,6 @@ def validated_run(plain: Any, source: str, trusted: Collection[str] = ()) -> Tra
                 f"{plus}{key}={target}"
             )
     return config
-
-
-def policy_kind(name: str) -> str | None:
-    """Returns what `policy=` names, a "baseline", "run", "saved" or "external"; None for nothing.
-
-    A saved agent is "pretrained" or in a .safetensors file. An external policy, from another
-    project, is path.py:make, package.module:make or path.pt2.
-    """
-    if name in get_args(BaselineName):
-        return "baseline"
-    if name == "pretrained":
-        return "saved"
-    if Path(name).is_dir():  # its name may hold a colon
-        return "run"
-    if name.endswith(".safetensors"):
-        return "saved"
-    return "external" if ":" in name or name.endswith(".pt2") else None
-
-
-def check_policy(name: str) -> None:
-    """Raises UsageError if `policy=` names no policy, as far as can be told without PyTorch."""
-    kind = policy_kind(name)
-    if kind is None:
-        raise UsageError(
-            f"policy={name}: give {', '.join(get_args(BaselineName))}, pretrained, a run's folder, "
-            "path.safetensors, path.py:make, package.module:make or path.pt2"
-        )
-    script, _, _ = name.rpartition(":")
-    file = script if script.endswith(".py") else name
-    is_file = file.endswith((".py", ".pt2", ".safetensors"))
-    if kind in ("saved", "external") and is_file and not Path(file).is_file():
-        raise UsageError(f"policy={name}: there is no file '{file}'")
 
 
 def check_reader_options(reader: type, options: Mapping[str, Any]) -> None:

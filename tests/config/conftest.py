@@ -12,7 +12,6 @@ SCHEMAS = {
     "factorize": schema.FactorizeConfig,
     "report": schema.ReportConfig,
     "view": schema.ViewConfig,
-    "export": schema.ExportConfig,
 }
 
 

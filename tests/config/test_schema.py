@@ -4,7 +4,6 @@ import pytest
 
 from flowrep.config.schema import (
     EvaluateConfig,
-    ExportConfig,
     FactorizeConfig,
     ReportConfig,
     TrainConfig,
@@ -122,7 +121,6 @@ def test_representations_keep_the_order_of_the_command_line():
         ("run=here policy=gredy", "policy"),
         ("policy=[greedy,mine.py:make]", "policy"),
         ("policy=mine.py:make representations=[ego]", "scene"),
-        ("policy=mine.py:make scene=s_turn", "representations"),
     ],
 )
 def test_an_evaluation_that_can_not_be_is_refused(line, key):
@@ -160,7 +158,6 @@ def test_what_is_wrong_in_a_run_folder_is_named_with_the_file():
         ("evaluate", EvaluateConfig, [
             "policy=a.py:make", "scene=s_turn", "flow=exact", "noise=none", "representations=[ego]",
         ]),
-        ("export", ExportConfig, ["run=x", "representations=[ego]"]),
         ("view", ViewConfig, ["representations=[ego]"]),
         ("factorize", FactorizeConfig, ["format=tum", "input=x", "output=y"]),
         ("report", ReportConfig, ["run=x"]),

@@ -12,7 +12,8 @@ pytest.importorskip("pybullet", reason="agents drive in the simulated street")
 import flowrep
 from flowrep.agent import CheckpointError, save_checkpoint
 from flowrep.config import group_choices
-from flowrep.experiment.agents import PRETRAINED, Agent, packed, unpacked
+from flowrep.experiment.agents import Agent
+from flowrep.experiment.policies import PRETRAINED, packed, unpacked
 from flowrep.experiment.run import RunFolder
 from flowrep.scenes import load_scene
 from flowrep.usage import UsageError
@@ -189,7 +190,7 @@ def test_an_evaluation_that_can_not_be_is_refused(given, named):
         ("pretrained", {}, "scene"),
         ("pretrained", {"scene": "s_turn", "num_envs": 0}, "num_envs"),
         ("pretrained", {"scene": "s_turn", "num_workers": "many"}, "num_workers"),
-        ("pretrained", {"scene": "s_turn", "device": None}, "device"),
+        ("pretrained", {"scene": "s_turn", "device": "gpu"}, "device"),
         ("missing:make", {"representations": "ego"}, r"\['ego'\]"),
         ("missing:make", {"representations": ["eog"]}, "eog"),
         ("missing:make", {"representations": ["ego"], "motion": "extact"}, "motion"),

@@ -1,16 +1,13 @@
 """Policies of somebody else's: what they see, and what is said of those that can't be used."""
 
-import json
-import shlex
 import zipfile
-from dataclasses import replace
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Categorical, Composite, Unbounded
 
-from flowrep.experiment.external import ExternalPolicy, PolicyError, Task, check_card, load_policy
+from flowrep.experiment.policies import ForeignFunction, ForeignPolicy, PolicyError, Task
 
 TASK = Task(
     scene="straight_road",
@@ -46,7 +43,7 @@ def maps(count=2):
     ids=["list", "tensor", "array", "tensordict"],
 )
 def test_actions_may_come_in_any_form(given):
-    policy = ExternalPolicy("mine", lambda maps: given, TASK)
+    policy = ForeignFunction("mine", lambda maps: given, TASK)
     action = policy(maps())["action"]
     assert action.dtype == torch.int64
     assert action.tolist() == [2, 0]
@@ -54,7 +51,7 @@ def test_actions_may_come_in_any_form(given):
 
 def test_a_policy_sees_its_maps_and_nothing_of_the_env():
     seen = []
-    ExternalPolicy("mine", lambda maps: seen.append(maps) or [0, 0], TASK)(maps())
+    ForeignFunction("mine", lambda maps: seen.append(maps) or [0, 0], TASK)(maps())
     assert sorted(seen[0].keys()) == ["depth", "ego", "env_id", "is_init"]
     assert seen[0].batch_size == (2,)
 
@@ -67,7 +64,7 @@ def test_make_is_told_the_task_and_may_import_what_lies_beside_it(tmp_path):
         "def make(task):\n"
         "    return lambda maps: [my_net.SIDE * len(task.representations)] * len(maps)\n"
     )
-    assert load_policy(f"{path}:make", TASK)(maps(3))["action"].tolist() == [2, 2, 2]
+    assert ForeignPolicy(f"{path}:make").built_for(TASK)(maps(3))["action"].tolist() == [2, 2, 2]
 
 
 def test_two_policies_do_not_share_what_lies_beside_one(tmp_path):
@@ -76,11 +73,9 @@ def test_two_policies_do_not_share_what_lies_beside_one(tmp_path):
         (tmp_path / name / "my_model.py").write_text(f"SIDE = {number}\n")
         script = "import my_model\nmake = lambda task: lambda maps: [my_model.SIDE] * len(maps)"
         (tmp_path / name / "mine.py").write_text(script)
-    first = load_policy(f"{tmp_path}/first/mine.py:make", TASK)
-    assert load_policy(f"{tmp_path}/first/mine.py:make", TASK)(maps())["action"].tolist() == [0, 0]
-    with pytest.raises(PolicyError, match=r"first/my_model\.py instead of .*second/my_model\.py"):
-        load_policy(f"{tmp_path}/second/mine.py:make", TASK)
-    assert first(maps())["action"].tolist() == [0, 0]
+    paths = (f"{tmp_path}/{name}/mine.py:make" for name in ("first", "second", "first"))
+    policies = [ForeignPolicy(path).built_for(TASK) for path in paths]
+    assert [each(maps())["action"].tolist() for each in policies] == [[0, 0], [1, 1], [0, 0]]
 
 
 def test_a_folder_of_data_or_a_shared_helper_is_in_no_policys_way(tmp_path):
@@ -92,7 +87,7 @@ def test_a_folder_of_data_or_a_shared_helper_is_in_no_policys_way(tmp_path):
     (tmp_path / "other" / "my_weights.py").symlink_to(tmp_path / "one" / "my_weights.py")
     (tmp_path / "other" / "json").mkdir()
     for name in ("one", "other"):
-        policy = load_policy(f"{tmp_path}/{name}/mine.py:make", TASK)
+        policy = ForeignPolicy(f"{tmp_path}/{name}/mine.py:make").built_for(TASK)
         assert policy(maps())["action"].tolist() == [0, 0]
 
 
@@ -106,7 +101,9 @@ def test_a_program_that_torch_saved_is_a_policy(tmp_path):
     program = torch.export.export(Scores(), given, dynamic_shapes=(batch, batch))
     torch.export.save(program, tmp_path / "agent.pt2")
     # Depths 1 and 2 are nearest to the scores of actions 1 and 2.
-    assert load_policy(str(tmp_path / "agent.pt2"), TASK)(maps())["action"].tolist() == [1, 2]
+    assert ForeignPolicy(str(tmp_path / "agent.pt2")).built_for(TASK)(maps())[
+        "action"
+    ].tolist() == [1, 2]
 
 
 @pytest.mark.parametrize(
@@ -122,7 +119,7 @@ def test_a_program_that_torch_saved_is_a_policy(tmp_path):
 )
 def test_what_is_no_action_is_named(given, said):
     with pytest.raises(PolicyError, match=f"^policy 'mine' returned .*{said}"):
-        ExternalPolicy("mine", lambda maps: given, TASK)(maps())
+        ForeignFunction("mine", lambda maps: given, TASK)(maps())
 
 
 @pytest.mark.parametrize(
@@ -141,7 +138,7 @@ def test_what_fails_in_a_policy_is_one_line_with_its_place(tmp_path, body, name,
     path = tmp_path / "mine.py"
     path.write_text(body)
     with pytest.raises(PolicyError, match=said) as caught:
-        load_policy(f"{path}:{name}", TASK)(maps())
+        ForeignPolicy(f"{path}:{name}").built_for(TASK)(maps())
     assert str(caught.value).startswith(f"policy '{path}:{name}'")
     assert len(str(caught.value).splitlines()) == 1
 
@@ -151,7 +148,7 @@ def test_what_is_not_there_or_damaged_is_named(name, tmp_path):
     (tmp_path / "agent.pt2").write_text("something else")
     for each in (name, f"{tmp_path}/agent.pt2"):
         with pytest.raises(PolicyError, match=each.partition(".")[0]):
-            load_policy(each, TASK)
+            ForeignPolicy(each).built_for(TASK)
 
 
 @pytest.mark.parametrize("kind", ["text", "zip"])
@@ -162,113 +159,8 @@ def test_of_a_program_that_is_none_nothing_is_logged(kind, tmp_path, caplog):
         with zipfile.ZipFile(path, "w") as file:
             file.writestr("agent/version", "3")
     with pytest.raises(PolicyError, match=str(path)):
-        load_policy(str(path), TASK)
+        ForeignPolicy(str(path)).built_for(TASK)
     assert not caplog.records
-
-
-# An exported agent on maps other than its own is refused, with what it takes to put it right.
-
-# 60 degrees up and down 30 rows are 15 / tan(30) = 25.98 pixels of focal length.
-K = [[25.98076, 0.0, 26.5], [0.0, 25.98076, 14.5], [0.0, 0.0, 1.0]]
-OPTIONS = {"ego": {"scale": 1.0}, "seg": {"encoding": "ids"}}
-CARD = {
-    "maps": [
-        {"name": "ego", "shape": [2, 30, 52], "options": OPTIONS["ego"]},
-        {"name": "seg", "shape": [1, 30, 52], "options": OPTIONS["seg"]},
-    ],
-    "intrinsics": K,
-    "num_classes": 5,
-    "scene": "straight_road",
-}
-
-
-def task(names=("ego", "seg"), size=(30, 52), classes=5, channels=2, **changes):
-    specs = {
-        "ego": Unbounded((channels, *size)),
-        "seg": Categorical(classes, (1, *size), dtype=torch.uint8),
-        "depth": Unbounded((1, *size)),
-    }
-    made = Task(
-        scene="straight_road",
-        representations={name: OPTIONS.get(name, {}) for name in names},
-        observation_spec=Composite({name: specs[name] for name in names}),
-        action_spec=Categorical(3),
-        intrinsics=torch.tensor(K),
-        device=torch.device("cpu"),
-    )
-    return replace(made, **changes)
-
-
-@pytest.fixture(params=["agent.pt2", "load_agent.py:make"])
-def agent(request, tmp_path):
-    (tmp_path / "agent.json").write_text(json.dumps(CARD))
-    return f"{tmp_path}/{request.param}"
-
-
-def test_an_agent_passes_on_its_own_maps_in_any_order(agent):
-    check_card(agent, task())
-    check_card(agent, task(["seg", "depth", "ego"]))
-
-
-SCALED = {**OPTIONS, "ego": {"scale": 0.5}}
-
-
-@pytest.mark.parametrize(
-    ("shown", "here", "give"),
-    [
-        (
-            task(size=(60, 104), intrinsics=2 * torch.tensor(K)),
-            "scene.camera.height_px=60 scene.camera.width_px=104",
-            "scene.camera.height_px=30 scene.camera.width_px=52",
-        ),
-        (  # 15 pixels of focal length see 45 degrees up and 45 down
-            task(intrinsics=torch.tensor([[15.0, 0, 26.5], [0, 15.0, 14.5], [0, 0, 1]])),
-            "scene.camera.fov_deg=90.0",
-            "scene.camera.fov_deg=60.0",
-        ),
-        (task(["ego"]), "representations=[ego]", "representations=[ego,seg]"),
-        (task(["depth"]), "representations=[depth]", "representations=[ego,seg]"),
-        (
-            task(representations=SCALED),
-            "representations.ego.scale=0.5",
-            "representations.ego.scale=1.0",
-        ),
-        (task(classes=6, scene="s_turn"), "scene=s_turn", "scene=straight_road"),
-        (task(channels=3, scene="s_turn"), "scene=s_turn", "scene=straight_road"),
-    ],
-    ids=["size", "view", "one too few", "others", "options", "classes", "one-hot classes"],
-)
-def test_other_maps_are_refused_with_the_overrides_for_its_own(agent, shown, here, give):
-    with pytest.raises(PolicyError) as caught:
-        check_card(agent, shown)
-    message = str(caught.value)
-    assert message.startswith(f"policy '{agent}'")
-    assert message.endswith(f" {here}; give {give}")
-    assert "\n" not in message
-
-
-def test_a_card_does_not_say_what_a_shell_would_run(agent, tmp_path):
-    maps = [{**CARD["maps"][0], "name": "ego]; touch PWNED; $(id) '"}]
-    (tmp_path / "agent.json").write_text(json.dumps(CARD | {"maps": maps}))
-    with pytest.raises(PolicyError) as caught:
-        check_card(agent, task())
-    words = shlex.split(str(caught.value).partition("; give ")[2], posix=True)
-    assert words == ["representations=[ego]; touch PWNED; $(id) ']"]
-
-
-def test_policies_that_flowrep_did_not_export_are_left_alone(tmp_path):
-    other = task(size=(9, 9))
-    check_card("package.module:make", other)
-    check_card(f"{tmp_path}/agent.pt2", other)  # without a card
-    (tmp_path / "agent.json").write_text(json.dumps(CARD))
-    check_card(f"{tmp_path}/mine.py:make", other)
-
-
-@pytest.mark.parametrize("text", ["", "{}", '{"maps": [{"name": "ego"}]}'])
-def test_a_damaged_card_is_named(text, tmp_path):
-    (tmp_path / "agent.json").write_text(text)
-    with pytest.raises(PolicyError, match=r"agent\.pt2"):
-        check_card(f"{tmp_path}/agent.pt2", task())
 
 
 def test_a_policy_that_changes_its_maps_changes_nothing_of_the_envs():
@@ -277,5 +169,5 @@ def test_a_policy_that_changes_its_maps_changes_nothing_of_the_envs():
         return [0, 0]
 
     seen = maps().apply(torch.clone)
-    ExternalPolicy("mine", spoil, TASK)(seen)
+    ForeignFunction("mine", spoil, TASK)(seen)
     assert (seen["depth"] > 0).all()

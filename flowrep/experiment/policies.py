@@ -1,0 +1,385 @@
+"""What `policy=` names, a class a kind: a run, a saved agent, a baseline, a foreign policy."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import sysconfig
+import traceback
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
+from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.export.passes import move_to_device_pass
+from torchrl.data import Composite, TensorSpec
+
+from flowrep.agent import CheckpointError, load_checkpoint
+from flowrep.baselines import BASELINES
+from flowrep.config.cli import composed
+from flowrep.config.schema import EnvConfig, Machine, TrainConfig, validated, validated_run
+from flowrep.envs import street_envs
+from flowrep.experiment import build
+from flowrep.experiment.run import RunFolder, check_origin, origin_of
+from flowrep.scenes import Scene, load_scene
+from flowrep.transforms.stack import REPRESENTATIONS, representation_options
+from flowrep.usage import UsageError, closest_first
+
+PRETRAINED = Path(__file__).parents[1] / "pretrained"
+"""Agents that come with flowrep, one for each scene; README.md there is their card."""
+Loaded = tuple[Any, EnvConfig, int, Scene | None]
+"""The fields of a `Driver`: policy, config of its env, frames and scene of its training."""
+Stored = tuple[TrainConfig, dict[str, Any], Path]
+
+
+def policy_of(name: str | Path) -> NamedPolicy:
+    """Returns what `policy=` names; raises UsageError if that is nothing."""
+    name = str(name)
+    if name in BASELINES:
+        return Baseline(name)
+    if Path(name).is_dir():  # its name may hold a colon
+        return RunPolicy(name)
+    if name == "pretrained" or name.endswith(".safetensors"):
+        return SavedPolicy(name)
+    if ":" in name or name.endswith(".pt2"):
+        return ForeignPolicy(name)
+    raise UsageError(
+        f"policy={name}: give {', '.join(BASELINES)}, pretrained, a run's folder, "
+        "path.safetensors, path.py:make, package.module:make or path.pt2"
+    )
+
+
+class NamedPolicy:
+    """A policy by its name, of one of four kinds."""
+
+    takes: ClassVar = ("scene", "device", "num_envs", "num_workers")
+    """The keywords of `Agent.load` that describe its env."""
+    has_scene = False
+    """Whether it drives in the scene of its training unless another one is given."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def load(self, env: Mapping[str, Any], trusted: Collection[str], precision: Any) -> Loaded:
+        """Returns the policy in the env that keywords describe; None stands for none."""
+        raise NotImplementedError
+
+    def _given(self, env: Mapping[str, Any]) -> dict[str, Any]:
+        """Returns the keywords that were given, after a check of those of every kind."""
+        given = {key: value for key, value in env.items() if value is not None}
+        if others := given.keys() - self.takes:
+            raise UsageError(f"{min(others)}= is not for policy={self.name}: leave it out")
+        machine = {"device": "auto", "num_envs": None, "num_workers": 0}
+        machine |= {key: given[key] for key in machine if key in given}
+        given |= {key: value for key, value in validated(Machine, machine) if value is not None}
+        return given | ({"scene": load_scene(given["scene"])} if "scene" in given else {})
+
+
+class Baseline(NamedPolicy):
+    """A policy that reads the simulator's state and sees no map, such as the planner."""
+
+    def load(self, env: Mapping[str, Any], trusted: Collection[str], precision: Any) -> Loaded:
+        """Returns its name, which `evaluation.evaluate` takes for a policy."""
+        config = _env_config(self._given({**env, "precision": precision}))
+        return self.name, config.model_copy(update={"representations": {}}), 0, None
+
+
+class TrainedPolicy(NamedPolicy):
+    """An agent that flowrep trained: its camera remains that of the training."""
+
+    has_scene = True
+
+    def load(self, env: Mapping[str, Any], trusted: Collection[str], precision: Any) -> Loaded:
+        """Returns the network with its weights, with `precision` in that number format."""
+        maps = env.get("representations")
+        # `_target_` alone is no map: it trusts a class that a run names, as `trusted` does.
+        if isinstance(maps, Mapping) and all({*(x or {})} == {"_target_"} for x in maps.values()):
+            env = {**env, "representations": None}
+        given = self._given(env)
+        trained, state, path = self.stored(given.get("scene"), trusted)
+        if not isinstance(state["frames"], int):
+            raise CheckpointError(f"{path} is a checkpoint, but not of an agent")
+        if "scene" in given:
+            given["scene"] = replace(given["scene"], camera=trained.scene.camera)
+        config = build.with_precision(trained.model_copy(update=given), precision)
+        with closing(build.env(config, num_envs=1, num_workers=0)) as street:
+            policy = build.policy(config, street)
+        try:
+            policy.load_state_dict(unpacked(state["policy"]))
+        except (RuntimeError, TypeError, AttributeError) as error:
+            reason = str(error).splitlines()[-1].strip()
+            raise CheckpointError(
+                f"the agent in {path} can't be used in scene '{config.scene.name}': the file is "
+                f"damaged, or the scene's classes are not those of its training ({reason})"
+            ) from error
+        return policy, config, state["frames"], trained.scene
+
+    def stored(self, scene: Scene | None, trusted: Collection[str]) -> Stored:
+        """Returns the config of its training, the state with `frames` and `policy`, their file."""
+        raise NotImplementedError
+
+
+class RunPolicy(TrainedPolicy):
+    """The agent of a run, by the run's folder."""
+
+    def stored(self, scene: Scene | None, trusted: Collection[str]) -> Stored:
+        """Reads the last checkpoint."""
+        run = RunFolder.existing(self.name)
+        config, path = run.config(trusted), run.checkpoint_path
+        state = load_checkpoint(path, ["origin", "frames", "policy"])
+        check_origin(state["origin"], origin_of(config.plain()), path)
+        return config, state, path
+
+
+class SavedPolicy(TrainedPolicy):
+    """An agent in a file that `Agent.save` wrote; "pretrained" is flowrep's for the scene."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.has_scene = name != "pretrained"
+        if self.has_scene and not Path(name).is_file():
+            raise UsageError(f"policy={name}: there is no such file")
+
+    def stored(self, scene: Scene | None, trusted: Collection[str]) -> Stored:
+        """Reads the file."""
+        path = Path(self.name) if self.has_scene else _pretrained(scene)
+        state = load_checkpoint(path, ["config", "frames", "policy"])
+        return validated_run(state["config"], path.name, trusted), state, path
+
+
+def _pretrained(scene: Scene | None) -> Path:
+    if scene is None:
+        raise UsageError("scene needs a value for policy=pretrained")
+    files = {file.stem: file for file in PRETRAINED.glob("*.safetensors")}
+    if scene.name not in files:
+        there = closest_first(scene.name, files)
+        raise UsageError(
+            f"no agent for scene '{scene.name}' comes with flowrep; there are: {there}"
+        )
+    return files[scene.name]
+
+
+_SCALE = ".scale"
+
+
+def packed(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Returns matrices and filters as int8 with a scale for each row, other weights unchanged.
+
+    A weight is rounded to 1/127 of the largest in its row. That is coarser than bfloat16, in which
+    agents compute; README.md of the pretrained agents gives the success of one with and without it.
+    """
+    stored = {}
+    for name, weight in weights.items():
+        stored[name] = weight
+        if weight.is_floating_point() and weight.ndim > 1:
+            scale = weight.flatten(1).abs().amax(1) / 127
+            columns = scale.clamp(min=1e-12).view(-1, *[1] * (weight.ndim - 1))
+            stored[name] = (weight / columns).round().to(torch.int8)
+            stored[name + _SCALE] = scale
+    return stored
+
+
+def unpacked(stored: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Returns the weights that `packed` stored; others are unchanged.
+
+    >>> weights = {"weight": torch.tensor([[1.0, -0.5], [0.0, 0.0]])}
+    >>> unpacked(packed(weights))["weight"]
+    tensor([[ 1.0000, -0.5039],
+            [ 0.0000,  0.0000]])
+    """
+    weights = dict(stored)
+    for whole in [key for key in stored if key + _SCALE in stored]:
+        scale = weights.pop(whole + _SCALE)
+        weights[whole] = stored[whole] * scale.view(-1, *[1] * (stored[whole].ndim - 1))
+    return weights
+
+
+def _env_config(given: Mapping[str, Any]) -> EnvConfig:
+    """Returns the config of an env for a policy without one: `given`, and the defaults of conf/."""
+    maps = given.get("representations", {})
+    if isinstance(maps, str):
+        raise UsageError(f"representations: give a list, ['{maps}']")
+    if isinstance(maps, Mapping):
+        defaults, _, _ = composed({})
+        options = {name: _whole_options(name) | (maps[name] or {}) for name in maps}
+        given = {**given, "representations": options or defaults.representations}
+    else:
+        defaults, _, _ = composed({"representations": [*maps]})
+        given = {**given, "representations": defaults.representations}
+    return validated(
+        EnvConfig, {key: getattr(defaults, key) for key in EnvConfig.model_fields} | given
+    )
+
+
+def _whole_options(name: str) -> dict[str, Any]:
+    """Returns a representation's options with their defaults, none for one of the user's."""
+    return representation_options(name) if name in REPRESENTATIONS else {}
+
+
+# Policies from other projects.
+
+
+class PolicyError(Exception):
+    """A policy from another project is missing, fails or returns no actions."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a policy from another project gets to know about its task."""
+
+    scene: str
+    representations: Mapping[str, Any]  # options by name, in the requested order
+    observation_spec: Composite  # of the maps of one environment, `[C, H, W]` each
+    action_spec: TensorSpec  # of one environment: 0 goes straight on, 1 turns left, 2 turns right
+    intrinsics: Tensor  # K `[3, 3]` of the maps, pixels
+    device: torch.device  # of the maps
+
+
+class ForeignPolicy(NamedPolicy):
+    """A policy from another project: path.py:make, package.module:make or path.pt2.
+
+    `make` is a function that takes the task and returns the policy's function. A path.pt2 is a
+    program that `torch.export.save` wrote: it takes the maps as arguments, in the task's order, and
+    returns a score per action.
+    """
+
+    takes = (*NamedPolicy.takes, "representations", "flow", "motion", "noise")
+
+    def load(self, env: Mapping[str, Any], trusted: Collection[str], precision: Any) -> Loaded:
+        """Returns the policy, built for the task in the env."""
+        given = self._given({**env, "precision": precision})
+        if not given.get("representations"):
+            raise UsageError(f"representations needs a value for policy={self.name}")
+        config = _env_config(given)
+        with closing(build.env(config, num_envs=1, num_workers=0)) as street:
+            maps = {name: street.observation_spec[name][0] for name in config.representations}
+            task = Task(
+                scene=config.scene.name,
+                representations=config.representations,
+                observation_spec=Composite(maps),
+                action_spec=street.action_spec[0],
+                intrinsics=torch.from_numpy(street_envs(street)[0].K),
+                device=build.device(config.device),
+            )
+        return self.built_for(task), config, 0, None
+
+    def built_for(self, task: Task) -> ForeignFunction:
+        """Returns the policy for a task."""
+        with _naming_policy(self.name):
+            if self.name.endswith(".pt2"):
+                return ForeignFunction(self.name, _program(self.name, task), task)
+            module, _, name = self.name.rpartition(":")
+            act = getattr(_module(module), name)(task)
+            if not callable(act):
+                what = f"{name}(task) returned a {type(act).__name__}"
+                raise PolicyError(f"{what}; expected a function of a TensorDict of maps")
+        return ForeignFunction(self.name, act, task)
+
+
+class ForeignFunction:
+    """Writes `action` `[N]`, computed by a function from another project.
+
+    The function takes a TensorDict of batch `[N]` with the task's maps `[N, C, H, W]` and, for
+    policies with a memory, `env_id` int64 `[N]`, the env of each row, and `is_init` bool `[N, 1]`,
+    whether its episode just began. It returns N integers (a tensor, an array or a list), or the
+    TensorDict with `action`.
+    """
+
+    def __init__(self, name: str, act: Callable[[TensorDictBase], Any], task: Task) -> None:
+        self.name, self._act, self._task = name, act, task
+
+    def __call__(self, maps: TensorDictBase) -> TensorDictBase:
+        """Returns the maps with `action`."""
+        # A copy, since the env reads the maps again if the policy changes them.
+        seen = maps.select(*self._task.representations, "env_id", "is_init").clone()
+        with _naming_policy(self.name):
+            given = self._act(seen)
+        if isinstance(given, TensorDictBase):
+            given = given.get("action")
+        n = int(self._task.action_spec.space.n)
+        try:
+            actions = torch.as_tensor(given).cpu()
+            whole = actions.long()
+            if actions.shape != maps.batch_size:
+                what = f"{actions.dtype} of shape {tuple(actions.shape)}"
+            elif ((whole == actions) & (whole >= 0) & (whole < n)).all():
+                return maps.set("action", whole)
+            else:
+                what = str(actions.tolist())
+        except (TypeError, ValueError, RuntimeError):
+            what = f"a {type(given).__name__}"
+        raise PolicyError(
+            f"policy '{self.name}' returned {what}; expected {len(maps)} whole numbers from 0 to "
+            f"{n - 1}, one action per environment"
+        )
+
+
+_FOLDERS: set[Path] = set()  # of the scripts that were loaded
+
+
+def _module(name: str) -> Any:
+    if not name.endswith(".py"):
+        return import_module(name)
+    path = Path(name).resolve(strict=True)
+    # Under a name that an earlier script imported, Python would give this one the same module.
+    for loaded, module in list(sys.modules.items()):
+        file = Path(getattr(module, "__file__", None) or "/")
+        if {file.parent, file.parent.parent} & (_FOLDERS - {path.parent}):
+            del sys.modules[loaded]
+    _FOLDERS.add(path.parent)
+    sys.path.insert(0, str(path.parent))  # as Python does for a script
+    spec = spec_from_file_location(f"flowrep_policy_{path.stem}", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    sys.modules[module.__name__] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def _program(path: str, task: Task) -> Callable[[TensorDictBase], Tensor]:
+    Path(path).resolve(strict=True)
+    logger = logging.getLogger("torch.export")  # prints the traceback of a damaged file
+    was_disabled, logger.disabled = logger.disabled, True
+    try:
+        loaded = torch.export.load(path)
+    except Exception as error:
+        raise PolicyError(
+            "is damaged, or was not saved by torch.export.save of this PyTorch; save it again"
+        ) from error
+    finally:
+        logger.disabled = was_disabled
+    # Moving only the module would not change the devices that are written in its graph.
+    program = move_to_device_pass(loaded, task.device).module()
+    return lambda maps: program(*(maps[name] for name in task.representations)).argmax(-1)
+
+
+# Prefixes of the names of files that the author of a policy didn't write.
+_LIBRARIES = (
+    sysconfig.get_path("stdlib"), sysconfig.get_path("purelib"), str(Path(__file__).parents[1]),
+    "<frozen ",
+)  # fmt: skip
+
+
+@contextmanager
+def _naming_policy(name: str) -> Iterator[None]:
+    """Turns an exception in a policy's code into a PolicyError: one line, with file and line."""
+    try:
+        yield
+    except PolicyError as error:
+        raise PolicyError(f"policy '{name}': {error}") from error.__cause__
+    except Exception as error:
+        text = str(error).strip().splitlines()
+        # The last line that the author wrote, rather than one deep in a library.
+        frames = traceback.extract_tb(error.__traceback__)
+        theirs = [frame for frame in frames if not frame.filename.startswith(_LIBRARIES)]
+        where = f" ({theirs[-1].filename}, line {theirs[-1].lineno})" if theirs else ""
+        raise PolicyError(
+            f"policy '{name}' failed: {type(error).__name__}: {text[0] if text else ''}{where}"
+        ) from error
