@@ -86,7 +86,7 @@ def test_workers_step_environments_where_cores_are_free(
 
     made = Mock()
     monkeypatch.setattr(build, "make_env", made)
-    monkeypatch.setattr(build, "available_cores", lambda: cores)
+    monkeypatch.setattr("flowrep.envs.workers.available_cores", lambda: cores)
     monkeypatch.setattr(build, "device", torch.device)
     build.env(composed(change, "num_envs=4", "algorithm.batch_size=64", f"device={device}"))
     assert made.call_args.kwargs["num_workers"] == workers

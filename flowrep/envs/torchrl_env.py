@@ -20,7 +20,7 @@ from flowrep.geometry.checks import checked_count
 from flowrep.scenes.load import load_scene
 from flowrep.scenes.scene import Range, Scene, num_classes
 from flowrep.scenes.vehicle import YAW_SIGN
-from flowrep.simulator.camera import choose_renderer, sensor_intrinsics
+from flowrep.simulator.camera import choose_renderer
 from flowrep.transforms import Mirror, representation_stack
 from flowrep.transforms.base import as_keys
 from flowrep.transforms.stack import FLOWS, DropKeys, Representations
@@ -148,7 +148,7 @@ def make_env(
     if representations:
         transforms = representation_stack(
             representations,
-            intrinsics=torch.from_numpy(sensor_intrinsics(loaded.camera)),
+            intrinsics=torch.from_numpy(loaded.camera.K),
             num_classes=num_classes(loaded.categories),
             compiled=compiled,
             flow=flow,
@@ -188,7 +188,7 @@ def make_mirror(
     >>> make_mirror("straight_road", ["ego", "seg2"]).swapped_actions
     tensor([0, 2, 1])
     """
-    names, K = as_keys(representations), sensor_intrinsics(load_scene(scene).camera)
+    names, K = as_keys(representations), load_scene(scene).camera.K
     flows = [name for name in names if name in FLOWS]
     swapped = [YAW_SIGN.index(-sign) for sign in YAW_SIGN]
     return Mirror(names, flow_keys=flows, swapped_actions=swapped, intrinsics=K.tolist())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Mapping
 from pkgutil import resolve_name
 from typing import Any
@@ -16,7 +15,7 @@ from flowrep.agent.observation import resolved_precision
 from flowrep.config.schema import EnvConfig, TrainConfig, validated
 from flowrep.envs import make_env, make_mirror
 from flowrep.envs.torchrl_env import usable_device
-from flowrep.envs.workers import available_cores
+from flowrep.envs.workers import worker_count
 from flowrep.options import ALGORITHMS, AlgorithmOptions
 from flowrep.usage import UsageError
 
@@ -38,7 +37,7 @@ def env(config: EnvConfig, **changes: Any) -> EnvBase:
     num_envs = changes.get("num_envs", config.num_envs)
     num_workers = changes.get("num_workers", config.num_workers)
     if num_workers == "auto":
-        num_workers = worker_count(num_envs, busy_cores=_busy_cores(config))
+        num_workers = worker_count(num_envs, _busy_cores(config))
     arguments: dict[str, Any] = {
         "scene": config.scene,
         "representations": config.representations,
@@ -145,19 +144,11 @@ def share_cores(config: EnvConfig) -> None:
         torch.set_num_threads(1)
 
 
-def worker_count(num_envs: int, busy_cores: int = 0) -> int:
-    """Returns the number of worker processes: one for each core that isn't busy."""
-    # In a pool of processes, as with hydra/launcher=joblib, the others use the other cores.
-    is_in_pool = multiprocessing.current_process().name != "MainProcess"
-    cores = available_cores()
-    return 0 if is_in_pool or min(cores, num_envs) < 2 else min(cores - busy_cores, num_envs)
-
-
 def _busy_cores(config: EnvConfig) -> int:
     """Returns the number of cores that a training's updates use."""
     if not isinstance(config, TrainConfig) or device(config.device).type != "cpu":
         return 0
-    return min(config.threads, available_cores())
+    return config.threads
 
 
 def evaluation_workers(config: EnvConfig, num_envs: int) -> int:

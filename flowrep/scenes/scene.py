@@ -9,9 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import AfterValidator, ConfigDict, Field, Strict, StringConstraints
 
-from flowrep.choices import FRAME_RATES_HZ, SpeedMode
+from flowrep.choices import FRAME_RATES_HZ, PRINCIPAL_POINT_SHIFT_PX, SpeedMode
 
 Kind = Literal["house", "tree", "fence", "car", "traffic_light", "lamp_post"]
 Range = tuple[float, float]
@@ -133,6 +135,13 @@ class CameraConfig(Part):
     def focal_px(self) -> float:
         """The focal length in pixels, the same along both axes."""
         return 0.5 * self.height_px / math.tan(math.radians(self.fov_deg) / 2)
+
+    @property
+    def K(self) -> NDArray[np.float64]:
+        """The intrinsics [3, 3] of depth, class, instance and flow maps."""
+        # Not quite in the middle: see PRINCIPAL_POINT_SHIFT_PX.
+        cx_px, cy_px = np.array([self.width_px, self.height_px]) / 2 + PRINCIPAL_POINT_SHIFT_PX
+        return np.array([[self.focal_px, 0.0, cx_px], [0.0, self.focal_px, cy_px], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True)

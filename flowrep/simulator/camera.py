@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrep.choices import Renderer
+from flowrep.choices import PRINCIPAL_POINT_SHIFT_PX, Renderer
 from flowrep.simulator.motion import rigid_inverse
 
 if TYPE_CHECKING:  # scenes need shapely and pydantic, which `flowrep.pybullet` shouldn't import
@@ -25,16 +25,8 @@ _GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 def sampled_intrinsics(fx_px: float, fy_px: float, height_px: int, width_px: int) -> Matrix:
     """Returns the K [3, 3] at which PyBullet's software renderer takes its samples."""
-    # It samples pixel (column i, row j), whose centre is (i + 0.5, j + 0.5), at (i, j + 1) of a
-    # camera with principal point (W / 2, H / 2). The K that unprojects onto the true surfaces is
-    # therefore shifted by (+0.5, -0.5); `tests/envs/test_camera.py` measures this.
-    rows = [fx_px, 0.0, width_px / 2 + 0.5], [0.0, fy_px, height_px / 2 - 0.5], [0.0, 0.0, 1.0]
-    return np.array(rows)
-
-
-def sensor_intrinsics(camera: CameraConfig) -> Matrix:
-    """Returns the K [3, 3] of a scene's depth, class, instance and flow maps."""
-    return sampled_intrinsics(camera.focal_px, camera.focal_px, camera.height_px, camera.width_px)
+    cx_px, cy_px = np.array([width_px, height_px]) / 2 + PRINCIPAL_POINT_SHIFT_PX
+    return np.array([[fx_px, 0.0, cx_px], [0.0, fy_px, cy_px], [0.0, 0.0, 1.0]])
 
 
 def gl_projection(

@@ -8,7 +8,6 @@ pytest.importorskip("pybullet", reason="a run is built with the simulator")
 
 from flowrep.agent import DoubleDQN, observation
 from flowrep.config.schema import ForeignAlgorithm
-from flowrep.experiment import build
 from flowrep.experiment.build import algorithm, evaluation_workers, with_precision
 from flowrep.options import ALGORITHMS
 from flowrep.usage import UsageError
@@ -101,6 +100,6 @@ def test_what_is_no_algorithm_is_refused(target, options, says):
 def test_an_evaluation_is_stepped_by_a_process_a_core_if_each_has_enough_to_do(
     monkeypatch, cores, asked, num_envs, workers
 ):
-    monkeypatch.setattr(build, "available_cores", lambda: cores)
+    monkeypatch.setattr("flowrep.envs.workers.available_cores", lambda: cores)
     config = composed("device=cpu").model_copy(update={"num_workers": asked})
     assert evaluation_workers(config, num_envs) == workers
