@@ -36,6 +36,7 @@ from flowrep.report.runs import (
     read_runs,
 )
 
+_MACHINE = ("commit", "precision", "cpu")
 RUNS, EPISODES, TRAINING = "runs.jsonl", "episodes.csv", "training.csv"
 
 
@@ -77,7 +78,8 @@ def write_archive(runs: Sequence[Run], path: Path) -> None:
     named = dict(sorted((Path(run.name).name, run) for run in runs))
     logged = list(dict.fromkeys(column for run in named.values() for column in run.metrics))
     lines = [
-        json.dumps({"run": name, **run.machine, "config": run.config}, ensure_ascii=False) + "\n"
+        json.dumps({"run": name, **machine_of(run), "config": run.config}, ensure_ascii=False)
+        + "\n"
         for name, run in named.items()
     ]
     tables = {
@@ -91,6 +93,18 @@ def write_archive(runs: Sequence[Run], path: Path) -> None:
             archive.writestr(ZipInfo(name), text.encode("utf-8"), ZIP_DEFLATED, 9)
     path.parent.mkdir(parents=True, exist_ok=True)
     replace_files(path.parent, {path.name: data.getvalue()})
+
+
+def machine_of(run: Run) -> dict[str, str]:
+    """Returns what machine.json says of a run: what trained it, and from when to when."""
+    assert run.folder is not None
+    path = run.folder / "machine.json"
+    machines = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
+    # A run that was resumed on another machine has several.
+    each = {key: dict.fromkeys(str(machine.get(key)) for machine in machines) for key in _MACHINE}
+    ends = [("started", machines[0]), ("ended", machines[-1])] if machines else []
+    times = {key: str(machine[key]) for key, machine in ends if machine.get(key)}
+    return {key: " | ".join(names) or "unknown" for key, names in each.items()} | times
 
 
 def _check_names(runs: Iterable[Run]) -> None:

@@ -23,9 +23,12 @@ from flowrep.report.runs import (
     paired_scores,
     success_rate,
 )
-from flowrep.report.statistics import UNSEEN, Array, Effect, effect, holm, improvement, permuted_p
+from flowrep.report.statistics import LEVEL, Array, Effect, effect, holm, improvement
 
 SHORT = dict(zip(SCENES, ("SR", "ST", "H", "T")))
+UNSEEN = "not seen with this recipe"
+_CLAIMED = {"more": "higher", "less": "lower"}
+_DRAWS = 20_000  # of permutations: the standard error of p = 0.05 is then 0.0015
 _COLLAPSED = 0.2  # success at its training speeds below which a run counts as collapsed
 
 Studies = Mapping[str, Mapping[str, Sequence[Run]]]
@@ -85,7 +88,52 @@ class Contrast:
         """Returns "holds", "contradicted", `UNSEEN` or "can't be tested"."""
         if self.effect is None:
             return "can't be tested"
-        return self.effect.verdict_on(self.asked["expect"], self.p_value, self.p_against)
+        return verdict_on(self.asked["expect"], self.effect, self.p_value, self.p_against)
+
+
+def verdict_on(expect: str, found: Effect, p_value: float, p_against: float) -> str:
+    """Returns whether a claim "holds", is "contradicted", `UNSEEN` or "can't be tested".
+
+    Args:
+        expect: the claim about the difference: "more" or "less" than 0, or "equal".
+        found: the difference.
+        p_value: corrected p of the claim's test; for "equal", of `p_within` the margin.
+        p_against: corrected p of `p_beyond` the margin, which contradicts "equal".
+    """
+    if np.isnan(p_value):
+        return "can't be tested"
+    if p_value >= LEVEL:
+        return "contradicted" if expect == "equal" and p_against < LEVEL else UNSEEN
+    holds = expect == "equal" or found.verdict(p_value) == _CLAIMED[expect]
+    return "holds" if holds else "contradicted"
+
+
+def p_within(found: Effect, margin: float) -> float:
+    """Returns p of two one-sided tests that a difference is smaller than a margin."""
+    # The result is the larger p of the two tests: the one against the nearer end of the margin.
+    nearer = found._replace(value=abs(found.value) - margin)
+    return nearer.p_value / 2 if nearer.value < 0 else 1 - nearer.p_value / 2
+
+
+def p_beyond(found: Effect, margin: float) -> float:
+    """Returns the two-sided p of a difference that is larger than a margin."""
+    nearer = found._replace(value=abs(found.value) - margin)
+    return 1.0 if nearer.value < 0 else nearer.p_value
+
+
+def permuted_p(scenes: Sequence[Sequence[Array]]) -> float:
+    """Returns the two-sided p of no difference, by permuting runs between the sides of each scene.
+
+    It makes no assumption about the distribution of rates, so it is valid with outliers, too.
+    """
+    rng = np.random.default_rng(0)
+    totals = np.zeros(_DRAWS)
+    for first, second in scenes:
+        dealt = rng.permuted(np.tile(np.concatenate([first, second]), (_DRAWS, 1)), axis=1)
+        totals += dealt[:, : len(first)].mean(axis=1) - dealt[:, len(first) :].mean(axis=1)
+    seen = abs(effect(scenes).value)
+    # The observed assignment is one of the possible permutations, hence 1 + ... in both counts.
+    return float((1 + (abs(totals / len(scenes)) >= seen - 1e-9).sum()) / (1 + _DRAWS))
 
 
 class Claim(NamedTuple):
@@ -187,7 +235,7 @@ def _over(
     pairs = [sides for scene in chosen for sides in strata[scene]]
     together = _of_seeds(pairs) if asked.get("paired") else effect(pairs)
     if asked["expect"] == "equal":
-        p_values = together.p_within(asked["margin"]), together.p_beyond(asked["margin"])
+        p_values = p_within(together, asked["margin"]), p_beyond(together, asked["margin"])
     else:
         p_values = together.p_value, together.p_value
     higher = improvement(pairs) if "second" in asked else float("nan")

@@ -57,6 +57,7 @@ from paper.claims import (
     sensitivity,
     studies_of,
     undated,
+    verdict_on,
 )
 
 HERE = Path(__file__).parent
@@ -372,7 +373,7 @@ def answers_of(
     by_labels: dict[int, list[Answer]] = {}
     for (source, trained_at, *sides), found in led.items():
         if source == "labels" and tuple(sides) in _ROW_OF_SIDES:
-            verdict = _short(found.verdict_on("more", found.p_value, found.p_value))
+            verdict = _short(verdict_on("more", found, found.p_value, found.p_value))
             answer = Answer(found.interval(), verdict, f"{trained_at} m/s")
             by_labels.setdefault(_ROW_OF_SIDES[sides[0], sides[1]], []).insert(0, answer)
     return {

@@ -1,6 +1,5 @@
 """Runs for a report, read from folders: which may be compared, and the success of episodes."""
 
-import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property, reduce
@@ -36,7 +35,6 @@ STACKS = tuple(dict.fromkeys(FLOW_STACKS + COMPLEMENTARY_STACKS))
 DRAWN_BASELINES = ("never_turn", "random", "planner", "speed_blind")
 _REPRESENTATIONS = ("raw", "ego", "obj", "seg", "seg2", "depth", "depth2", "rgb")
 _OF_EVERY_SCENE = ("camera", "frame_rate_hz")  # keys whose values are the same in all scenes
-_MACHINE = ("commit", "precision", "cpu")
 _TYPES: dict[Any, type] = {"int": int, "float": float, "str": str}
 # Columns of evaluation.csv that don't follow from the run's config and the outcome.
 EPISODE_COLUMNS = {
@@ -64,7 +62,7 @@ class Run:
     episodes: Columns  # of evaluation.csv
     metrics: Columns  # of metrics.csv, nan where a cell is empty
     folder: Path | None = None  # where films and drives may be
-    machine: Mapping[str, str] = field(default_factory=dict)  # that trained it
+    machine: Mapping[str, str] = field(default_factory=dict)  # that trained it, of a packed run
 
     def __post_init__(self) -> None:
         config, scene = self.config, self.config["scene"]
@@ -138,7 +136,7 @@ def read_run(path: Path) -> Run:
             {k: [row[k] for row in t] for k in (t[0] if t else ())} for t in tables
         )
         columns = episode_columns(episodes), metric_columns(metrics)
-        return Run(str(path), config, *columns, path, _machine(path / "machine.json"))
+        return Run(str(path), config, *columns, path)
     except (RunFolderError, TableError):
         raise
     # Overflow: a seed of .inf, or of more digits than an integer of numpy holds.
@@ -164,18 +162,6 @@ def episode_columns(cells: Cells) -> Columns:
 def metric_columns(cells: Cells) -> Columns:
     """Returns the columns of metrics.csv, nan for empty cells."""
     return {name: np.array([float(x or "nan") for x in column]) for name, column in cells.items()}
-
-
-def _machine(path: Path) -> dict[str, str]:
-    # A run that was resumed on another machine has several machines.
-    try:
-        machines = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
-        values = {key: dict.fromkeys(str(each.get(key)) for each in machines) for key in _MACHINE}
-        ends = [("started", machines[0]), ("ended", machines[-1])] if machines else []
-        times = {key: str(machine[key]) for key, machine in ends if machine.get(key)}
-    except (ValueError, TypeError, AttributeError, RecursionError, LookupError) as error:
-        raise ValueError(f"{path.name}: {error}") from error
-    return {key: " | ".join(names) or "unknown" for key, names in values.items()} | times
 
 
 def without_repeats(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:

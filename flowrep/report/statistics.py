@@ -21,9 +21,6 @@ from flowrep.experiment.outcomes import wilson_interval
 Array = NDArray[np.float64]
 
 LEVEL = 0.05  # of tests; intervals cover 1 - LEVEL
-_DRAWS = 20_000  # of permutations: the standard error of p = 0.05 is then 0.0015
-UNSEEN = "not seen with this recipe"
-_CLAIMED = {"more": "higher", "less": "lower"}
 
 
 class Estimate(NamedTuple):
@@ -48,17 +45,6 @@ class Effect(NamedTuple):
             return 1.0 if self.value == 0 else float("nan")
         return float(2 * scipy.stats.t.sf(abs(self.value) / self.error, self.freedom))
 
-    def p_within(self, margin: float) -> float:
-        """Returns p of two one-sided tests that the difference is smaller than a margin."""
-        # The result is the larger p of the two tests: the one against the nearer end of the margin.
-        nearer = self._replace(value=abs(self.value) - margin)
-        return nearer.p_value / 2 if nearer.value < 0 else 1 - nearer.p_value / 2
-
-    def p_beyond(self, margin: float) -> float:
-        """Returns the two-sided p of a difference that is larger than a margin."""
-        nearer = self._replace(value=abs(self.value) - margin)
-        return 1.0 if nearer.value < 0 else nearer.p_value
-
     def interval(self) -> Estimate:
         """Returns the difference with its 95 % interval, which excludes 0 exactly if p < 0.05."""
         if self.error == 0:
@@ -73,21 +59,6 @@ class Effect(NamedTuple):
         if p_value >= LEVEL:
             return "not seen"
         return "higher" if self.value > 0 else "lower"
-
-    def verdict_on(self, expect: str, p_value: float, p_against: float) -> str:
-        """Returns whether a claim "holds", is "contradicted", `UNSEEN` or "can't be tested".
-
-        Args:
-            expect: the claim about the difference: "more" or "less" than 0, or "equal".
-            p_value: corrected p of the claim's test; for "equal", of `p_within` the margin.
-            p_against: corrected p of `p_beyond` the margin, which contradicts "equal".
-        """
-        if np.isnan(p_value):
-            return "can't be tested"
-        if p_value >= LEVEL:
-            return "contradicted" if expect == "equal" and p_against < LEVEL else UNSEEN
-        holds = expect == "equal" or self.verdict(p_value) == _CLAIMED[expect]
-        return "holds" if holds else "contradicted"
 
 
 def effect(scenes: Sequence[Sequence[Array]]) -> Effect:
@@ -107,21 +78,6 @@ def effect(scenes: Sequence[Sequence[Array]]) -> Effect:
     variance = sum(part for part, _ in parts)
     freedom = variance**2 / sum(part**2 / df for part, df in parts) if variance else float("nan")
     return Effect(float(np.mean(means)), variance**0.5 / len(scenes), freedom)
-
-
-def permuted_p(scenes: Sequence[Sequence[Array]]) -> float:
-    """Returns the two-sided p of no difference, by permuting runs between the sides of each scene.
-
-    It makes no assumption about the distribution of rates, so it is valid with outliers, too.
-    """
-    rng = np.random.default_rng(0)
-    totals = np.zeros(_DRAWS)
-    for first, second in scenes:
-        dealt = rng.permuted(np.tile(np.concatenate([first, second]), (_DRAWS, 1)), axis=1)
-        totals += dealt[:, : len(first)].mean(axis=1) - dealt[:, len(first) :].mean(axis=1)
-    seen = abs(effect(scenes).value)
-    # The observed assignment is one of the possible permutations, hence 1 + ... in both counts.
-    return float((1 + (abs(totals / len(scenes)) >= seen - 1e-9).sum()) / (1 + _DRAWS))
 
 
 def mean_share(scenes: Sequence[Array], episodes: int = 0) -> Estimate:

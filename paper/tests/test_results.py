@@ -6,6 +6,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import product
 
+import numpy as np
 import pytest
 import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -16,10 +17,11 @@ pytest.importorskip("jinja2", reason="reports are an extra")
 
 from flowrep.report.runs import Run, episode_columns, groups_of, without_repeats
 from flowrep.report.sections import assemble
-from flowrep.report.statistics import UNSEEN, Effect
+from flowrep.report.statistics import Effect
 from paper import results
 from paper.archive import read_archives
 from paper.claims import (
+    UNSEEN,
     Claim,
     Contrast,
     at_length,
@@ -27,6 +29,9 @@ from paper.claims import (
     claims_of,
     held_out_cells,
     held_out_claims,
+    p_beyond,
+    p_within,
+    permuted_p,
     scores,
     sensitivity,
     studies_of,
@@ -145,9 +150,28 @@ def test_alike_means_within_the_margin(value, error, verdict):
     assert equal_by(Effect(value, error, 10.0)).verdict == verdict
 
 
+def test_equality_is_tested_against_the_nearer_end_of_the_margin():
+    # 0.01 within ±0.05: (0.01 - 0.05) / 0.02 = -2, of 10 degrees p = 0.0367, and as far on the
+    # other side; 0.09 is as far beyond
+    for value in (0.01, -0.01):
+        assert p_within(Effect(value, 0.02, 10.0), 0.05) == pytest.approx(0.0367, abs=1e-4)
+        assert p_beyond(Effect(value, 0.02, 10.0), 0.05) == 1
+    assert p_within(Effect(0.09, 0.02, 10.0), 0.05) == pytest.approx(1 - 0.0367, abs=1e-4)
+    assert p_beyond(Effect(-0.09, 0.02, 10.0), 0.05) == pytest.approx(2 * 0.0367, abs=2e-4)
+
+
+def test_exchanging_runs_tells_how_often_chance_alone_gives_as_much():
+    # 3 of 6 runs succeed: 2 of the 20 ways to deal them to two sides are as unequal as this one,
+    # and in two scenes alike, 2 of 400 are.
+    sides = np.array([1, 1, 1]), np.array([0, 0, 0])
+    assert permuted_p([sides]) == pytest.approx(0.1, abs=0.01)
+    assert permuted_p([sides, sides]) == pytest.approx(0.005, abs=0.002)
+    assert permuted_p([(np.array([1, 0]), np.array([0, 1]))]) == 1.0
+
+
 def equal_by(found, margin=0.05):
     asked = HIGH | {"expect": "equal", "margin": margin}
-    return Contrast(asked, found, {}, found.p_within(margin), found.p_beyond(margin))
+    return Contrast(asked, found, {}, p_within(found, margin), p_beyond(found, margin))
 
 
 def test_a_claim_of_equality_shows_the_p_of_what_its_effect_suggests():

@@ -37,8 +37,6 @@ def test_runs_are_found_wherever_they_lie_and_once(tmp_path, name):
         ("config.yaml", yaml.safe_dump(config_of(total_frames=None)), "config.yaml"),
         ("evaluation.csv", "scene;fps\n1;2\n", "evaluation.csv"),
         ("metrics.csv", "frames,success\nmany,0.5\n", "'many'"),
-        ("machine.json", "[{", "machine.json"),
-        ("machine.json", "[1]", "machine.json"),
         ("config.yaml", yaml.safe_dump(config_of(seed=math.inf)), "config.yaml"),
         ("config.yaml", yaml.safe_dump(config_of(total_frames=math.inf)), "config.yaml"),
         ("metrics.csv", f"frames,success\n{'9' * 401},0.5\n", "table"),
