@@ -109,10 +109,15 @@ def test_an_agent_drives_in_another_scene_and_changed_scenes_are_told_apart(unto
     ]
 
 
-def test_an_agent_that_reads_classes_is_told_that_another_scene_has_others(tmp_path):
+def test_an_agent_that_reads_classes_drives_wherever_it_knows_them_all(tmp_path):
     folder = saved(tmp_path / "seg", "representations=[seg]")
-    with pytest.raises(CheckpointError, match="s_turn"):
+    with pytest.raises(CheckpointError, match=r"never saw terrain of scene 's_turn'"):
         evaluate(asked(f"run={folder.path}", "scene=s_turn"))
+    for name, *classes in (("s_turn", "scene=s_turn"), ("all", "scene.categories=all")):
+        folder = saved(tmp_path / name, "representations=[seg]", *classes)
+        other = "straight_road" if name == "s_turn" else "three_way_junction"
+        evaluate(asked(f"run={folder.path}", f"scene={other}", "baselines=[]"))
+        assert {row["scene"] for row in folder.read_episodes()} == {other}
 
 
 def test_an_edited_config_is_refused(untouched):

@@ -106,7 +106,15 @@ class TrainedPolicy(NamedPolicy):
         if not isinstance(state["frames"], int):
             raise CheckpointError(f"{path} is a checkpoint, but not of an agent")
         if "scene" in given:
-            given["scene"] = replace(given["scene"], camera=trained.scene.camera)
+            seen: dict[str, Any] = {"camera": trained.scene.camera}
+            if not {"seg", "seg2"}.isdisjoint(trained.representations):
+                seen["categories"] = trained.scene.categories
+                if new := sorted({*given["scene"].categories} - {*trained.scene.categories}):
+                    raise CheckpointError(
+                        f"the agent in {path} reads classes and never saw {', '.join(new)} of "
+                        f"scene '{given['scene'].name}': train one with scene.categories=all"
+                    )
+            given["scene"] = replace(given["scene"], **seen)
         config = build.with_precision(trained.model_copy(update=given), precision)
         with closing(build.env(config, num_envs=1, num_workers=0)) as street:
             policy = build.policy(config, street)
@@ -116,7 +124,7 @@ class TrainedPolicy(NamedPolicy):
             reason = str(error).splitlines()[-1].strip()
             raise CheckpointError(
                 f"the agent in {path} can't be used in scene '{config.scene.name}': the file is "
-                f"damaged, or the scene's classes are not those of its training ({reason})"
+                f"damaged, or its maps have another size there ({reason})"
             ) from error
         return policy, config, state["frames"], trained.scene
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, ConfigDict, Field, Strict, StringConstraints
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, Strict, StringConstraints
 
 from flowrep.choices import FRAME_RATES_HZ, PRINCIPAL_POINT_SHIFT_PX, SpeedMode
 
@@ -55,6 +55,10 @@ def _all_modes(ranges: dict[SpeedMode, Range]) -> dict[SpeedMode, Range]:
     if set(ranges) != set(get_args(SpeedMode)):
         raise ValueError(f"give all of {', '.join(get_args(SpeedMode))}")
     return ranges
+
+
+def _all_or_named(names: Any) -> Any:
+    return CATEGORIES if names == "all" else names
 
 
 def _named_once(parts: Sequence[Any]) -> Sequence[Any]:
@@ -401,8 +405,14 @@ class Scene(Part):
     """Steps per second."""
     time_limit_steps: Count
     """The longest episode in steps; at another frame rate, the limit in seconds stays the same."""
-    categories: Annotated[tuple[Name, ...], AfterValidator(_named_once)]
-    """All classes that the semantic map may show; `flowrep.scenes.CATEGORY_ID` has their ids."""
+    categories: Annotated[
+        tuple[Name, ...],
+        AfterValidator(_named_once),
+        BeforeValidator(_all_or_named, json_schema_input_type=tuple[Name, ...] | Literal["all"]),
+    ]
+    """The classes that the semantic map may show, whose ids are in `flowrep.scenes.CATEGORY_ID`; an
+    agent that reads them can drive wherever there are no others. `all` stands for those of all
+    scenes."""
     layout_seed: Whole
     """Seed of the houses' sizes and fronts, which are drawn once for the scene."""
     camera: CameraConfig
