@@ -70,7 +70,6 @@ def test_the_names_in_the_architecture_lead_somewhere():
     # `flowrep.train` or `experiment.build`; not `evaluation.csv`, `config.yaml` or a path
     names = {name.removeprefix("flowrep.") for name in re.findall(r"`([\w.]+\.\w+)`", text)}
     names -= {"evaluation.csv", "config.yaml"}
-    assert len(names) > 20
     for name in names:
         pkgutil.resolve_name(f"flowrep.{name}")
 
