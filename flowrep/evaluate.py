@@ -52,7 +52,7 @@ def run(config: EvaluateConfig) -> None:
     with StopRequest() as stop:
         for candidate in candidates:
             try:
-                with candidate.folder.held("evaluating"):
+                with candidate.folder.held():
                     evaluate_one(config, candidate, evaluations, stop)
             except Exception as error:
                 if len(candidates) == 1 or not is_a_mistake(error):

@@ -5,6 +5,7 @@ What needs PyTorch, which takes seconds to import, is imported when the config h
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from collections.abc import Iterable
@@ -19,9 +20,9 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
+from flowrep import sweep
 from flowrep.config.cli import OF_THE_MACHINE, checked, end_with, exit_with, line_for, run_command
-from flowrep.config.schema import TrainConfig
-from flowrep.experiment import sweep
+from flowrep.config.schema import TrainConfig, validated
 from flowrep.experiment.outcomes import is_finished, success_of
 from flowrep.options import ALGORITHMS
 from flowrep.progress import StopRequest
@@ -64,13 +65,33 @@ def run(config: TrainConfig) -> float:
     typed = list(job.overrides.task)
     if config.resume is not None:
         folder = RunFolder.existing(config.resume)
-        with folder.held("training", PATIENCE_S):
+        with folder.held(PATIENCE_S):
             return finish(resumed(config, folder, typed), folder)
     folder = RunFolder(job.runtime.output_dir)
-    with folder.held("training"):
+    with folder.held():
         folder.check_is_new()
         announce(config, str(job.runtime.choices.get("preset")))
         return finish(config, folder, typed)
+
+
+def run_of_sweep() -> None:
+    """Begins or resumes the run that `sweep.job` describes on stdin, and has checked."""
+    from flowrep.experiment.run import RunFolder
+
+    try:
+        asked = json.load(sys.stdin)
+        config, folder = validated(TrainConfig, asked["config"]), RunFolder(asked["folder"])
+        with folder.held(PATIENCE_S):
+            if folder.config_path.is_file():
+                machine = {key: getattr(config, key) for key in OF_THE_MACHINE}
+                stored = folder.config(config.trusted)
+                config = stored.model_copy(update=machine | {"resume": str(folder.path)})
+            else:
+                folder.check_is_new()
+                announce(config, asked["preset"])
+            finish(config, folder, asked["typed"])
+    except Exception as error:
+        end_with(error, TrainConfig)
 
 
 def resumed(config: TrainConfig, folder: RunFolder, typed: list[str]) -> TrainConfig:

@@ -24,7 +24,7 @@ from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
 import numpy as np
 
-from flowrep.experiment.lock import RunFolderError
+from flowrep.experiment.run import RunFolderError
 from flowrep.files import replace_files
 from flowrep.report.runs import (
     EPISODE_COLUMNS,

@@ -47,7 +47,8 @@ THIRD_PARTY_ONLY_IN = {
         "view.py",
         "factorize.py",
         "config/cli.py",
-        "experiment/sweep.py",
+        "config/foreign.py",
+        "sweep.py",
         "transforms/hydra_configs.py",
     },
 }

@@ -193,7 +193,7 @@ def test_the_runs_of_a_sweep_are_evaluated_on_the_same_episodes(some, monkeypatc
 @pytest.mark.parametrize("trouble", ["it can not be saved", "it is in use"])
 def test_a_run_in_trouble_costs_no_other_its_episodes(some, capsys, trouble):
     folders, config = some("good_1", "good_2")
-    in_use = folders[0].held("training") if trouble == "it is in use" else nullcontext()
+    in_use = folders[0].held() if trouble == "it is in use" else nullcontext()
     if trouble == "it can not be saved":
         (folders[0].path / "evaluation.csv").mkdir()
     with in_use, pytest.raises(SystemExit) as ended:
@@ -205,7 +205,7 @@ def test_a_run_in_trouble_costs_no_other_its_episodes(some, capsys, trouble):
     assert errors
     assert all(str(folders[0].path) in line for line in errors)
     assert str(folders[1].evaluation_path) in said.out
-    with folders[1].held("evaluating"):  # its lock is free again
+    with folders[1].held():  # its lock is free again
         pass
 
 

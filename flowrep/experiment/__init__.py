@@ -1,1 +1,1 @@
-"""Runs: folder and lock, training loop, evaluation, films and sweeps; and the agents they give."""
+"""Runs: folder, training loop, evaluation and films; and the agents that they give."""

@@ -62,7 +62,7 @@ class Agent(Driver):
         run = RunFolder(default if folder is None else folder)
         run.check_is_new()
         with (
-            run.held("training"),
+            run.held(),
             StopRequest() as stop,
             torch_threads(torch.get_num_threads()),  # the caller's again afterwards
             closing(Runner(config, run, on_log=callback)) as runner,

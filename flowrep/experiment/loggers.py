@@ -10,10 +10,10 @@ from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
-from flowrep.experiment.lock import RunFolderError
 from flowrep.experiment.outcomes import OUTCOMES, EpisodeRecord
 from flowrep.extras import require
 from flowrep.files import naming, replace_text
+from flowrep.usage import UsageError
 
 if TYPE_CHECKING:
     from torchrl.record.loggers import TensorboardLogger
@@ -72,7 +72,7 @@ class Loggers:
             replace_text(kept, uuid.uuid4().hex[:12])
         name = kept.read_text(encoding="utf-8")
         if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name):  # it becomes a part of paths
-            raise RunFolderError(f"{kept} does not hold a wandb run's id: restore or remove it")
+            raise UsageError(f"{kept} does not hold a wandb run's id: restore or remove it")
 
         from torchrl.record.loggers.wandb import WandbLogger
 

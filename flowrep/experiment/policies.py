@@ -58,7 +58,7 @@ def policy_of(name: str | Path) -> NamedPolicy:
 class NamedPolicy:
     """A policy by its name, of one of four kinds."""
 
-    takes: ClassVar = ("scene", "device", "num_envs", "num_workers")
+    takes: ClassVar[tuple[str, ...]] = ("scene", "device", "num_envs", "num_workers")
     """The keywords of `Agent.load` that describe its env."""
     has_scene = False
     """Whether it drives in the scene of its training unless another one is given."""

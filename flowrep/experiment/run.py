@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import yaml
+from filelock import FileLock, Timeout
 from numpy.typing import NDArray
 
 from flowrep import __version__
 from flowrep.config.schema import TrainConfig, validated_run
-from flowrep.experiment.lock import FolderLock, RunFolderError, locked
 from flowrep.experiment.loggers import Loggers
 from flowrep.experiment.outcomes import (
     EVALUATION_COLUMNS,
@@ -49,6 +49,15 @@ from flowrep.yaml_file import read_yaml
 
 if TYPE_CHECKING:
     import torch
+
+
+class RunFolderError(ValueError):
+    """A folder holds no run, or holds one where a new run should begin."""
+
+
+class FolderInUseError(OSError):
+    """Another process works in the folder."""
+
 
 DRIVES = "drives.npz"
 _TIMES = ("started", "ended")
@@ -175,7 +184,6 @@ class RunFolder:
         self.drives_path = self.path / DRIVES
         self.failures_path = self.path / "failures.csv"
         self.loggers = Loggers(self.path)
-        self._lock: FolderLock | None = None
 
     @classmethod
     def existing(cls, path: str | Path) -> RunFolder:
@@ -208,26 +216,27 @@ class RunFolder:
                 )
 
     @contextmanager
-    def held(self, doing: str, patience_s: float = 0.0) -> Iterator[None]:
-        """Locks the folder against other processes, see `locked`."""
+    def held(self, patience_s: float = 0.0) -> Iterator[None]:
+        """Creates the folder, and locks it against other processes until the context ends.
+
+        The kernel ends the lock with the process, even if that is killed. Another process may take
+        `patience_s` to release the folder.
+        """
         self.path.mkdir(parents=True, exist_ok=True)
-        for name in ("checkpoint", "tensorboard", "videos", "wandb", ".hydra"):
+        for name in (".lock", "checkpoint", "tensorboard", "videos", "wandb", ".hydra"):
             refuse_link(self.path / name)
-        with locked(self.path, doing, patience_s) as self._lock:
-            try:
-                yield
-            finally:
-                self._lock = None
-
-    def check_held(self) -> None:
-        """Checks that the folder is still locked, if this process locked it."""
-        if self._lock is not None:
-            self._lock.check()
-
-    def _prepare(self) -> None:
-        """Checks that this process may write to the folder, and creates it if necessary."""
-        self.check_held()
-        self.path.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(self.path / ".lock")
+        try:
+            lock.acquire(timeout=patience_s)
+        except Timeout:
+            raise FolderInUseError(
+                f"'{self.path}' is in use: another process trains or evaluates in it. Wait until "
+                "it has ended, or stop it"
+            ) from None
+        try:
+            yield
+        finally:
+            lock.release()
 
     def video_path(self, name: str) -> Path:
         """Returns the path of the video with this name."""
@@ -236,7 +245,6 @@ class RunFolder:
     def begin(self, config: TrainConfig, overrides: Iterable[str]) -> None:
         """Writes a new run's config and overrides."""
         self.check_is_new()
-        self._prepare()
         (self.path / ".hydra").mkdir(exist_ok=True)  # where Hydra keeps the overrides
         typed = yaml.safe_dump(list(overrides), allow_unicode=True)
         replace_text(self.path / ".hydra" / "overrides.yaml", typed)
@@ -250,7 +258,7 @@ class RunFolder:
 
     def write_config(self, config: Mapping[str, Any]) -> None:
         """Writes the resolved config."""
-        self._prepare()
+        self.path.mkdir(parents=True, exist_ok=True)
         replace_text(self.config_path, yaml.safe_dump(dict(config), sort_keys=False))
 
     def read_config(self) -> dict[str, Any]:
@@ -272,7 +280,6 @@ class RunFolder:
 
         If the last entry is of this machine, it is made longer.
         """
-        self._prepare()
         path, now = self.path / "machine.json", datetime.now(UTC).isoformat(timespec="seconds")
         machines: Any = []
         if path.is_file():
@@ -290,7 +297,6 @@ class RunFolder:
 
     def log_metrics(self, frames: int, metrics: Mapping[str, float]) -> None:
         """Appends one row to metrics.csv and logs the same values to TensorBoard and wandb."""
-        self._prepare()
         append_rows(self.metrics_path, [{"frames": frames, **metrics}])
         self.loggers.log(frames, metrics)
 
@@ -342,7 +348,6 @@ class RunFolder:
 
         They go to the end, so that running the same evaluation again results in the same file.
         """
-        self._prepare()
         new = [{name: str(cell) for name, cell in each.row().items()} for each in records]
         again = {_identity(row) for row in new}
         kept = [row for row in self.read_episodes() if _identity(row) not in again]

@@ -233,7 +233,6 @@ class Runner:
     def save(self) -> None:
         """Writes the checkpoint; the previous one stays intact until the new one is complete."""
         self.check()
-        self.folder.check_held()
         with self.clock("checkpoint"):
             save_checkpoint(self.folder.checkpoint_path, self.state())
         self.folder.note_machine(self.machine)

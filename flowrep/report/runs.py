@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrep.choices import SpeedMode
-from flowrep.experiment.lock import RunFolderError
 from flowrep.experiment.outcomes import EVALUATION_COLUMNS, OUTCOMES, EpisodeRecord
-from flowrep.experiment.run import RunFolder, flattened, origin_of
+from flowrep.experiment.run import RunFolder, RunFolderError, flattened, origin_of
 from flowrep.files import TableError
 from flowrep.report.statistics import Array, Estimate, mean_share
 

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("scipy", reason="reports are an extra")
 
-from flowrep.experiment.lock import RunFolderError
+from flowrep.experiment.run import RunFolderError
 from flowrep.report.runs import read_run, read_runs
 from paper.archive import read_archive, read_archives, write_archive
 from tests.report.folders import config_of, rows_of, run_in, write_run

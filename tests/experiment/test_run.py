@@ -1,14 +1,10 @@
 """A run's folder: one owner, tables that survive, a checkpoint that belongs to its config."""
 
 import copy
-import fcntl
 import json
 import multiprocessing
-import os
 import pickle
-import platform
 import shutil
-import subprocess
 import sys
 import time
 from datetime import UTC, datetime
@@ -21,190 +17,50 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from flowrep.agent import CheckpointError
-from flowrep.experiment.lock import FolderInUseError, RunFolderError
 from flowrep.experiment.outcomes import EVALUATION_COLUMNS, EpisodeRecord
-from flowrep.experiment.run import RunFolder, check_origin, machine_of, origin_of, read_drives
+from flowrep.experiment.run import (
+    FolderInUseError,
+    RunFolder,
+    RunFolderError,
+    check_origin,
+    machine_of,
+    origin_of,
+    read_drives,
+)
 from flowrep.files import TableError, write_rows
 from tests.config.composing import composed, plain
 
 
 def hold(run, is_held):
-    with run.held("training"):
+    with run.held():
         is_held.set()
         time.sleep(100)
 
 
-def test_who_holds_a_folder_is_named_and_one_that_was_killed_holds_it_no_more(tmp_path):
+def test_a_folder_has_one_process_and_one_that_was_killed_holds_it_no_more(tmp_path):
     run = RunFolder(tmp_path)
     fork = multiprocessing.get_context("fork")
     is_held = fork.Event()
     other = fork.Process(target=hold, args=(run, is_held), daemon=True)
     other.start()
     assert is_held.wait(timeout=60)
-    holder = rf"process {other.pid} on {platform.node()} .*training.* \d{{4}}-\d\d-\d\d "
-    with pytest.raises(FolderInUseError, match=holder), run.held("evaluating"):
+    with pytest.raises(FolderInUseError, match=str(tmp_path)), run.held():
         pass
     other.kill()
     other.join()
-    with run.held("evaluating"):
-        assert json.loads((tmp_path / ".lock").read_text())["pid"] == os.getpid()
-
-
-def test_it_is_given_back_whatever_happens_in_it(tmp_path):
-    run = RunFolder(tmp_path)
-    with pytest.raises(ZeroDivisionError), run.held("training"):
-        raise ZeroDivisionError
-    assert (tmp_path / ".lock").read_text() == ""
-    with run.held("training"):
-        (tmp_path / ".lock").write_text("half of {")  # the other has not said yet who it is
-        with pytest.raises(FolderInUseError), run.held("training"):
+    for _ in range(2):  # and it is given back
+        with run.held(), pytest.raises(FolderInUseError), RunFolder(tmp_path).held():
             pass
 
 
-def ended_process():
-    """The number of a process that has ended."""
-    with subprocess.Popen(["true"]) as process:
-        return process.pid
-
-
-def description(**changes):
-    found = {"pid": ended_process(), "host": platform.node(), "doing": "training", "since": "now"}
-    return json.dumps(found | changes)
-
-
-@pytest.mark.parametrize("changes", [{}, {"pid": 2**80}, "", "[]", "{}", '{"pid": "x"}'])
-def test_a_process_that_has_ended_is_never_named(tmp_path, changes):
-    """As in the moment after another took the folder of a killed one, before it says who it is."""
-    (tmp_path / ".lock").write_text(changes if isinstance(changes, str) else description(**changes))
-    with (tmp_path / ".lock").open() as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        with pytest.raises(FolderInUseError) as refused, RunFolder(tmp_path).held("training"):
-            pass
-    assert "process " not in str(refused.value).replace("another process ", "")
-
-
-def test_what_a_killed_process_left_in_the_lock_is_in_nobodys_way(tmp_path):
-    (tmp_path / ".lock").write_text(description())
-    with RunFolder(tmp_path).held("training"):
-        assert json.loads((tmp_path / ".lock").read_text())["pid"] == os.getpid()
-
-
-def moved(run):
-    run.path.rename(run.path.with_name("moved"))
-
-
-def removed(run):
-    (run.path / ".lock").unlink()
-
-
-def replaced(run):
-    removed(run)
-    (run.path / ".lock").touch()
-
-
-def put_back(run):
-    text = (run.path / ".lock").read_text()
-    removed(run)
-    (run.path / ".lock").write_text(text)
-
-
-@pytest.mark.parametrize("change", [moved, removed, replaced, put_back])
-def test_a_run_whose_lock_is_gone_stops_before_it_writes(tmp_path, change):
+def test_a_run_whose_folder_is_moved_begins_no_other_one(tmp_path):
     run = RunFolder(tmp_path / "run")
-    writes = [
-        lambda: run.log_metrics(20, {"alpha": 0.5}),
-        lambda: run.log_episodes([episode(2)]),
-        lambda: run.write_config({}),
-        run.check_held,
-    ]
-    with run.held("training"):
-        run.log_metrics(10, {"alpha": 0.5})
-        run.log_episodes([episode(1)])
-        before = (run.metrics_path.read_text(), run.evaluation_path.read_text())
-        change(run)
-        for write in writes:
-            with pytest.raises(RunFolderError, match=r"\.lock"):
+    with run.held():
+        run.path.rename(tmp_path / "moved")
+        for write in (lambda: run.note_machine({}), lambda: run.save_episodes([episode(2)])):
+            with pytest.raises(OSError, match="run/"):
                 write()
-    if change is moved:
-        assert not run.path.exists()
-        run = RunFolder(tmp_path / "moved")
-    assert (run.metrics_path.read_text(), run.evaluation_path.read_text()) == before
-    assert not run.config_path.exists()
-
-
-def test_one_that_takes_the_folder_of_a_removed_lock_keeps_it(tmp_path):
-    first, second = RunFolder(tmp_path), RunFolder(tmp_path)
-    with first.held("training"):
-        removed(first)
-        with second.held("training"):
-            with pytest.raises(RunFolderError, match=r"\.lock"):
-                first.check_held()
-            second.check_held()
-            with pytest.raises(FolderInUseError), RunFolder(tmp_path).held("evaluating"):
-                pass
-    with first.held("training"):
-        first.check_held()
-
-
-def test_a_lock_that_is_replaced_while_it_is_taken_is_not_held(tmp_path, monkeypatch):
-    run, flock = RunFolder(tmp_path), fcntl.flock
-
-    def replace_then_lock(*arguments):
-        replaced(run)
-        return flock(*arguments)
-
-    monkeypatch.setattr("flowrep.experiment.lock.fcntl.flock", replace_then_lock)
-    with pytest.raises(FolderInUseError), run.held("training"):
-        pass
-
-
-@pytest.fixture
-def no_locks(monkeypatch):
-    """A disk such as a network's, where nothing can be locked."""
-
-    def no_locks(*_):
-        raise OSError(37, "No locks available")
-
-    monkeypatch.setattr("flowrep.experiment.lock.fcntl.flock", no_locks)
-
-
-@pytest.mark.usefixtures("no_locks")
-def test_a_disk_without_locks_is_said_so_and_used(tmp_path, capsys):
-    (tmp_path / ".lock").write_text(description())  # of a killed process
-    with RunFolder(tmp_path).held("training"):
-        pass
-    assert "No locks" in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("no_locks")
-def test_on_a_disk_without_locks_one_process_of_a_machine_has_the_folder(tmp_path):
-    refused = pytest.raises(FolderInUseError, match=rf"process {os.getpid()} ")
-    with RunFolder(tmp_path).held("training"), refused, RunFolder(tmp_path).held("evaluating"):
-        pass
-
-
-@pytest.mark.usefixtures("no_locks")
-def test_on_a_disk_without_locks_the_last_machine_has_the_folder(tmp_path, monkeypatch):
-    here, there = RunFolder(tmp_path), RunFolder(tmp_path)
-    with here.held("training"):
-        monkeypatch.setattr("flowrep.experiment.lock.platform.node", lambda: "another")
-        with there.held("training"):
-            there.check_held()
-            with pytest.raises(RunFolderError, match=r"\.lock"):
-                here.check_held()
-        there_text = (tmp_path / ".lock").read_text()
-    assert there_text == ""
-
-
-@pytest.mark.usefixtures("no_locks")
-def test_the_first_machine_does_not_release_what_the_last_one_holds(tmp_path, monkeypatch):
-    here, there = RunFolder(tmp_path), RunFolder(tmp_path)
-    first, second = here.held("training"), there.held("training")
-    first.__enter__()
-    monkeypatch.setattr("flowrep.experiment.lock.platform.node", lambda: "another")
-    with second:
-        first.__exit__(None, None, None)
-        there.check_held()
+    assert not run.path.exists()
 
 
 PATH = Path("run/checkpoint/latest.safetensors")
@@ -433,6 +289,7 @@ def test_an_episode_that_is_evaluated_again_replaces_its_row(tmp_path):
 def test_an_evaluation_run_again_leaves_the_table_of_one_that_was_never_stopped(tmp_path, there):
     whole, stopped = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "stopped")
     for run in (whole, stopped):
+        run.path.mkdir()
         run.save_episodes([episode(seed, evaluation="training") for seed in (8, 9)])
     stopped.save_episodes([episode(seed, evaluation="final") for seed in there])
     for run in (whole, stopped):

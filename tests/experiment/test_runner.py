@@ -12,8 +12,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from flowrep.agent import CheckpointError, DivergenceError, load_checkpoint, save_checkpoint
 from flowrep.config import group_choices
 from flowrep.experiment import build
-from flowrep.experiment.lock import RunFolderError
-from flowrep.experiment.run import RunFolder
+from flowrep.experiment.run import RunFolder, RunFolderError
 from flowrep.experiment.runner import Every, Means, RecentEpisodes, Runner, progress_text
 from flowrep.progress import StopRequest
 from flowrep.train import finish as finish_run
@@ -313,20 +312,6 @@ def poison(runner, updates):
         return losses(batch) | {"q_loss": losses(batch)["q_loss"] * factor}
 
     runner.agent.losses = poisoned
-
-
-@pytest.mark.slow
-def test_a_run_whose_lock_is_removed_saves_nothing_more(tmp_path):
-    runner = new_run(tmp_path, more=["log_every_frames=1000"])
-    runner.observation = runner.env.reset()
-    with runner.folder.held("training"):
-        runner.save()
-        before = runner.folder.checkpoint_path.read_bytes()
-        (tmp_path / ".lock").unlink()
-        with pytest.raises(RunFolderError, match=r"\.lock"):
-            trained(runner)
-    runner.close()
-    assert runner.folder.checkpoint_path.read_bytes() == before
 
 
 @pytest.mark.slow
