@@ -132,7 +132,6 @@ def evaluate_one(
         if records := evaluation.records(**origin):
             try:
                 folder.log_episodes(records, drives=True)
-                folder.write_failures()
             except OSError as error:
                 raise OSError(f"{folder.path}: {error}; then evaluate again") from error
             print(folder.path)

@@ -129,7 +129,7 @@ def test_a_stored_representation_of_flowreps_names_no_code(config, folder):
 
 
 @pytest.mark.parametrize("name", ["a b", "x;y", "\x1b[2J"])
-def test_a_name_that_is_none_is_never_printed_to_be_pasted(config, folder, name):
+def test_a_name_that_no_map_can_have_is_not_offered_as_an_override(config, folder, name):
     run = RunFolder(folder / "run")
     own = {name: {"_target_": "mine.Edges"}}
     run.write_config(config.plain() | {"representations": own})

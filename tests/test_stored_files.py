@@ -22,7 +22,7 @@ from flowrep.config.schema import EvaluateConfig, ViewConfig, validated
 from flowrep.evaluate import candidates_of
 from flowrep.experiment import film, policies
 from flowrep.experiment.agents import Agent
-from flowrep.experiment.run import RunFolder, RunFolderError
+from flowrep.experiment.run import RunFolder, RunFolderError, read_drives
 from flowrep.scenes import SceneError, load_scene
 from flowrep.train import resumed
 from flowrep.usage import UsageError
@@ -118,7 +118,7 @@ def test_an_algorithm_typed_for_a_run_that_has_another_is_not_ignored(tmp_path):
 @pytest.mark.parametrize(
     "target", ["a b.C", "a.B; rm -rf x", "a.B\x1b[2J", "evil:A", "evil", "$(x).y"]
 )
-def test_a_name_that_is_none_is_never_printed_to_be_pasted(stranger, target):
+def test_a_name_that_no_class_can_have_is_not_offered_as_an_override(stranger, target):
     with pytest.raises(UsageError) as refused:
         evaluate(stranger(target))
     assert "algorithm._target_=" not in str(refused.value)
@@ -162,7 +162,6 @@ def test_a_list_that_a_config_holds_twice_is_read_again(tmp_path):
 WRITES = {
     "metrics.csv": lambda run: run.log_metrics(10, {"alpha": 0.5}),
     "evaluation.csv": lambda run: run.save_episodes([episode(1)]),
-    "failures.csv": lambda run: run.write_failures(),
     "machine.json": lambda run: run.note_machine({"cpu": "x"}),
     "config.yaml": lambda run: run.write_config({"seed": 1}),
     "checkpoint/latest.safetensors": lambda run: save_checkpoint(run.checkpoint_path, {"a": 1}),
@@ -208,6 +207,18 @@ def test_a_run_with_a_link_in_place_of_what_it_writes_does_not_begin(tmp_path, v
         pass
     assert victim.read_text() == before
     assert os.listdir(victim.parent) == ["victim"]
+
+
+def test_no_pipe_in_a_run_is_waited_for(tmp_path):
+    run = RunFolder(tmp_path / "a")
+    run.path.mkdir()
+    for name in ("config.yaml", "metrics.csv", "evaluation.csv", "drives.npz", "machine.json"):
+        os.mkfifo(run.path / name)
+    assert run.read_episodes() == run.read_metrics() == []
+    assert read_drives(run.drives_path) == {}
+    run.note_machine({"cpu": "x"})
+    with pytest.raises(RunFolderError):
+        RunFolder.all_in(tmp_path)
 
 
 @pytest.mark.parametrize("text", ["../../x", "a/b", "", "x" * 65, "a\nb"])

@@ -99,7 +99,7 @@ def test_a_run_leaves_a_folder_that_a_person_can_open(smoke_run):
     assert (run / "videos" / "episode_normal.mp4").stat().st_size > 1e4
     assert {path.name for path in run.iterdir() if not path.name.startswith(".")} == {
         "config.yaml", "metrics.csv", "tensorboard", "checkpoint",
-        "drives.npz", "evaluation.csv", "failures.csv", "machine.json", "videos",
+        "drives.npz", "evaluation.csv", "machine.json", "videos",
     }  # fmt: skip
 
 
@@ -119,14 +119,12 @@ def test_a_run_says_what_it_is_where_it_runs_and_how_it_went(smoke_run):
 
 def test_a_complete_run_is_not_evaluated_twice(smoke_run):
     run, _ = smoke_run
-    tables = [run / "evaluation.csv", run / "failures.csv"]
-    before = [table.read_text() for table in tables]
-    tables[1].unlink()  # a full disk, say, left out what comes after the evaluation
+    before = (run / "evaluation.csv").read_text()
     film = run / "videos" / "episode_normal.mp4"
     film.write_bytes(film.read_bytes()[:5000])  # of a version that didn't notice a full disk
     assert "this run is complete" in command("train", f"resume={run}", cwd=run)
     assert is_playable(film)
-    assert [table.read_text() for table in tables] == before
+    assert (run / "evaluation.csv").read_text() == before
 
 
 def test_evaluate_adds_rows_for_what_was_asked(smoke_run):

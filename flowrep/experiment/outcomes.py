@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rich import box
 from rich.console import Console
@@ -28,9 +28,18 @@ OUTCOMES = ("success", "collision", "out_of_bounds", "timeout")
 """How an episode can end. Repeated here, as `flowrep.envs`, which defines it, needs PyBullet."""
 
 CAUSES = ("out of bounds", "collision: pedestrian", "collision: other", "timeout")
-_FAILURE_GROUP = (
-    "scene", "scene_id", "representations", "flow", "frames", "evaluation", "policy", "speed", "fps"
-)  # fmt: skip
+
+
+class EpisodeKey(NamedTuple):
+    """The columns that tell a run's episodes apart; older tables need `scene`, too."""
+
+    scene_id: str
+    evaluation: str
+    frames: int
+    policy: str
+    speed: str
+    fps: float
+    episode_seed: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +67,11 @@ class EpisodeRecord:
     length: int  # the number of steps T
     # The vehicle's x and y in metres, `[T + 1, 2]`; stored in drives.npz.
     positions: NDArray[np.float32] = field(repr=False, compare=False)
+
+    @property
+    def key(self) -> EpisodeKey:
+        """What tells it apart from the run's other episodes."""
+        return EpisodeKey(*(getattr(self, name) for name in EpisodeKey._fields))
 
     def row(self) -> dict[str, Any]:
         """Returns the episode's row in evaluation.csv, by column."""
@@ -135,52 +149,36 @@ def outcome_shares(outcomes: Iterable[str]) -> dict[str, tuple[float, float, flo
     }
 
 
-def failure_causes(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Returns the number of failures and their causes in % for each scene, policy and speed.
-
-    Shares are of the failures, as in the paper's Table III, and empty where nothing failed.
-    Evaluations after different numbers of training frames are kept apart.
-    """
-    groups: dict[tuple[str, ...], list[str]] = defaultdict(list)
+def failure_causes(rows: Iterable[Mapping[str, Any]]) -> Counter[str]:
+    """Returns how many episodes failed by each of `CAUSES`, which are the paper's Table III."""
+    causes: Counter[str] = Counter()
     for row in rows:
-        key = tuple(str(row.get(name, "")) for name in _FAILURE_GROUP)
         cause = row["outcome"].replace("_", " ")
         if cause == "collision":
-            cause += ": pedestrian" if row.get("hit") == "pedestrian" else ": other"
-        groups[key].append(cause)
-    table = []
-    for key, causes in groups.items():
-        counts = Counter(causes)
-        failures = len(causes) - counts["success"]
-        shares = {c: round(100 * counts[c] / failures, 1) if failures else "" for c in CAUSES}
-        collisions = counts["collision: pedestrian"] + counts["collision: other"]
-        ratio = round(counts["out of bounds"] / collisions, 3) if collisions else ""
-        line = dict(zip(_FAILURE_GROUP, key)) | {"episodes": len(causes), "failures": failures}
-        table.append(line | shares | {"out of bounds to collisions": ratio})
-    return table
+            cause += ": pedestrian" if row["hit"] == "pedestrian" else ": other"
+        causes[cause] += cause != "success"
+    return causes
 
 
 def print_results(rows: Sequence[Mapping[str, Any]]) -> None:
     """Prints the share of each outcome, and the causes of failure, by policy and speed."""
-    by_policy: dict[tuple[Any, ...], list[str]] = defaultdict(list)
+    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = defaultdict(list)
     for row in rows:
-        by_policy[row["speed"], f"{float(row['fps']):g}", row["policy"]].append(row["outcome"])
-    table = [
-        {"speed": speed, "fps": fps, "policy": policy, "episodes": len(outcomes)}
-        | {
+        groups[row["speed"], f"{float(row['fps']):g}", row["policy"]].append(row)
+    shares, causes = [], []
+    for key, episodes in groups.items():
+        named = dict(zip(("speed", "fps", "policy"), key))
+        cells = {
             name: f"{100 * share:.0f} [{100 * low:.0f}–{100 * high:.0f}]"
-            for name, (share, low, high) in outcome_shares(outcomes).items()
+            for name, (share, low, high) in outcome_shares(e["outcome"] for e in episodes).items()
         }
-        for (speed, fps, policy), outcomes in by_policy.items()
-    ]
-    print_table("Share of episodes in % [95 % interval]", table)
-    table = [
-        {"speed": line["speed"], "fps": f"{float(line['fps']):g}", "policy": line["policy"]}
-        | {"failures": f"{line['failures']} of {line['episodes']}"}
-        | {cause: "" if line[cause] == "" else f"{line[cause]:.0f}" for cause in CAUSES}
-        for line in failure_causes(rows)
-    ]
-    print_table("Causes of failure in % of the failures", table)
+        shares.append(named | {"episodes": len(episodes)} | cells)
+        failed = failure_causes(episodes)
+        total = failed.total()
+        cells = {cause: f"{100 * failed[cause] / total:.0f}" if total else "" for cause in CAUSES}
+        causes.append(named | {"failures": f"{total} of {len(episodes)}"} | cells)
+    print_table("Share of episodes in % [95 % interval]", shares)
+    print_table("Causes of failure in % of the failures", causes)
 
 
 def print_table(title: str, rows: Sequence[Mapping[str, Any]], least_width: int = 100) -> None:

@@ -15,8 +15,9 @@ import zipfile
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
@@ -28,8 +29,8 @@ from flowrep.config.schema import TrainConfig, validated_run
 from flowrep.experiment.loggers import Loggers
 from flowrep.experiment.outcomes import (
     EVALUATION_COLUMNS,
+    EpisodeKey,
     EpisodeRecord,
-    failure_causes,
     read_episodes,
 )
 from flowrep.files import (
@@ -134,22 +135,10 @@ def cpu_name() -> str:
     return next(iter(names), platform.processor() or platform.machine())
 
 
-class DriveKey(NamedTuple):
-    """The columns that identify an episode of drives.npz and, with `scene`, of evaluation.csv."""
-
-    scene_id: str
-    evaluation: str
-    frames: int
-    policy: str
-    speed: str
-    fps: float
-    episode_seed: int
-
-
-def read_drives(path: Path) -> dict[DriveKey, tuple[str, NDArray[np.float32]]]:
+def read_drives(path: Path) -> dict[EpisodeKey, tuple[str, NDArray[np.float32]]]:
     """Returns each drive's outcome and positions `[T + 1, 2]`, x and y in metres.
 
-    Without a file there are none. It holds the columns of `DriveKey`; `outcome`; `positions`
+    Without a file there are none. It holds the columns of `EpisodeKey`; `outcome`; `positions`
     `[sum of T + 1, 2]`; and `starts` `[N + 1]`, so that drive n is
     `positions[starts[n]:starts[n + 1]]`.
 
@@ -164,10 +153,10 @@ def read_drives(path: Path) -> dict[DriveKey, tuple[str, NDArray[np.float32]]]:
         if size > _MOST_BYTES:
             raise ValueError(f"holds {size:,} bytes, more than {_MOST_BYTES:,}")
         with np.load(path, allow_pickle=False) as saved:
-            names = zip(*(saved[column].tolist() for column in DriveKey._fields), strict=True)
+            names = zip(*(saved[column].tolist() for column in EpisodeKey._fields), strict=True)
             positions = np.split(saved["positions"].reshape(-1, 2), saved["starts"][1:-1])
             driven = zip(saved["outcome"].tolist(), positions, strict=True)
-            return dict(zip(map(DriveKey._make, names), driven, strict=True))
+            return dict(zip(map(EpisodeKey._make, names), driven, strict=True))
     except Exception as error:  # zip, zlib and numpy fail on garbage in a dozen ways
         raise TableError(f"{path}: {error}") from error
 
@@ -182,7 +171,6 @@ class RunFolder:
         self.checkpoint_path = self.path / "checkpoint" / "latest.safetensors"
         self.evaluation_path = self.path / "evaluation.csv"
         self.drives_path = self.path / DRIVES
-        self.failures_path = self.path / "failures.csv"
         self.loggers = Loggers(self.path)
 
     @classmethod
@@ -348,9 +336,10 @@ class RunFolder:
 
         They go to the end, so that running the same evaluation again results in the same file.
         """
+        identity = itemgetter("scene", *EpisodeKey._fields)
         new = [{name: str(cell) for name, cell in each.row().items()} for each in records]
-        again = {_identity(row) for row in new}
-        kept = [row for row in self.read_episodes() if _identity(row) not in again]
+        again = {identity(row) for row in new}
+        kept = [row for row in self.read_episodes() if identity(row) not in again]
         write_rows(self.evaluation_path, [*kept, *new], EVALUATION_COLUMNS)
 
     def _save_drives(self, records: Iterable[EpisodeRecord]) -> None:
@@ -361,19 +350,10 @@ class RunFolder:
             set_aside(self.drives_path, error.__cause__)
             drives = {}
         for each in records:
-            drive = DriveKey(*(getattr(each, name) for name in DriveKey._fields))
-            drives[drive] = each.outcome, each.positions
+            drives[each.key] = each.outcome, each.positions
         outcomes, positions = zip(*drives.values())
-        arrays: dict[str, Any] = dict(zip(DriveKey._fields, map(np.array, zip(*drives))))
+        arrays: dict[str, Any] = dict(zip(EpisodeKey._fields, map(np.array, zip(*drives))))
         arrays["outcome"], arrays["positions"] = np.array(outcomes), np.concatenate(positions)
         arrays["starts"] = np.cumsum([0, *map(len, positions)])
         with replace_file(self.drives_path) as partial:
             np.savez_compressed(partial, **arrays)
-
-    def write_failures(self) -> None:
-        """Writes the causes of the failures in evaluation.csv to failures.csv."""
-        write_rows(self.failures_path, failure_causes(self.read_episodes()))
-
-
-def _identity(row: Mapping[str, str]) -> tuple[str, ...]:
-    return tuple(row[name] for name in ("scene", *DriveKey._fields))

@@ -198,13 +198,12 @@ class Runner:
         return True
 
     def film(self) -> None:
-        """Writes the table of failures; films an episode if none is filmed."""
+        """Films an episode if none is filmed."""
         # Drawing takes seconds to import.
         from flowrep.experiment.film import record_episode
         from flowrep.viz import is_playable
 
         self.close()  # its worker processes take memory, and so does filming
-        self.folder.write_failures()
         path = self.folder.video_path(f"episode_{self.config.speed}")
         if self.config.evaluation.video and not is_playable(path):
             driver = Driver(self.agent.policy, self.config, self.frames)

@@ -234,12 +234,6 @@ def test_what_has_no_weights_is_not_saved(tmp_path):
         Agent.load("never_turn", scene="s_turn").save(tmp_path / "x.safetensors")
 
 
-def test_maps_given_to_what_has_its_maps_are_not_ignored():
-    for name in ("pretrained", "planner"):
-        with pytest.raises(UsageError, match=f"representations=.*{name}"):
-            Agent.load(name, scene="s_turn", representations={"obj": {}})
-
-
 def test_a_baseline_may_be_asked_for_workers_which_it_can_t_use():
     agent = Agent.load("never_turn", scene="straight_road", num_workers=1)
     assert len(agent.evaluate(2)) == 2

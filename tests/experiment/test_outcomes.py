@@ -5,6 +5,7 @@ import math
 import pytest
 
 from flowrep.experiment.outcomes import (
+    CAUSES,
     EVALUATION_COLUMNS,
     OUTCOMES,
     failure_causes,
@@ -15,7 +16,6 @@ from flowrep.experiment.outcomes import (
     wilson_interval,
 )
 from flowrep.experiment.run import RunFolder
-from flowrep.files import read_rows
 from tests.experiment.test_run import episode
 
 
@@ -79,22 +79,10 @@ def failed_rows(policy="greedy", ends=ENDS):
     return [same | {"policy": policy, "outcome": outcome, "hit": hit} for outcome, hit in ends]
 
 
-def test_shares_are_of_the_failures():
-    (line,) = failure_causes(failed_rows())
-    assert (line["episodes"], line["failures"]) == (10, 8)
-    # Of 8: 2 off the road, 3 into people, 1 into a car, 2 too slow.
-    assert line["out of bounds"] == 25.0
-    assert line["collision: pedestrian"] == 37.5
-    assert line["collision: other"] == 12.5
-    assert line["timeout"] == 25.0
-    assert line["out of bounds to collisions"] == 0.5
-
-
-def test_policies_and_moments_of_training_are_told_apart_and_no_failure_has_no_shares():
-    rows = [row | {"frames": frames} for frames in (1000, 9000) for row in failed_rows()]
-    early, late, planner = failure_causes(rows + failed_rows("planner", [("success", "")] * 3))
-    assert (early["frames"], late["frames"], late["failures"]) == ("1000", "9000", 8)
-    assert (planner["policy"], planner["failures"], planner["timeout"]) == ("planner", 0, "")
+def test_failures_are_counted_by_cause():
+    # 2 off the road, 3 into people, 1 into a car, 2 too slow
+    assert [failure_causes(failed_rows())[cause] for cause in CAUSES] == [2, 3, 1, 2]
+    assert failure_causes(failed_rows(ends=ENDS[:2])).total() == 0
 
 
 def test_tables_show_shares_with_intervals_and_causes_and_nothing_is_cut_off(capsys):
@@ -111,13 +99,3 @@ def test_the_names_of_policies_and_tables_are_printed_as_they_are(capsys, name):
     print_results(failed_rows(name))
     print_table(f"of {name}", [{"policy": "as wide as its title"}])
     assert capsys.readouterr().out.count(name) == 3
-
-
-def test_the_table_of_causes_is_replaced(tmp_path):
-    folder = RunFolder(tmp_path)
-    for _ in range(2):
-        folder.save_episodes([episode(k, end, hit=hit) for k, (end, hit) in enumerate(ENDS)])
-        folder.write_failures()
-    (line,) = read_rows(folder.failures_path)
-    assert line["collision: pedestrian"] == "37.5"
-    assert float(line["timeout"]) == pytest.approx(25.0)
