@@ -427,6 +427,9 @@ def validated_run(plain: Any, source: str, trusted: Collection[str] = ()) -> Tra
 
 def check_reader_options(reader: type, options: Mapping[str, Any]) -> None:
     """Checks the section `format` against the reader's parameters, except for the first one."""
+    # Not ???, which would not replace the value of the format that this one extends.
+    for key in [key for key, value in options.items() if value == "needed"]:
+        raise UsageError(f"format.{key} needs a value: format.{key}=...")
     hints = get_type_hints(reader.__init__)  # type: ignore[misc]
     _, *parameters = inspect.signature(reader).parameters.values()
     fields: dict[str, Any] = {

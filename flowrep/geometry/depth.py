@@ -11,7 +11,7 @@ from torch import Tensor
 from flowrep.geometry.camera import pixel_rays
 from flowrep.geometry.checks import check_name, check_shape, common_batch
 
-DepthKind: TypeAlias = Literal["z", "ray_length", "z_buffer", "reversed_z_buffer"]
+DepthKind: TypeAlias = Literal["z", "ray_length", "disparity", "z_buffer", "reversed_z_buffer"]
 
 # How far a depth buffer may be from 1 where nothing is drawn. The float32 products in PyBullet's
 # software renderer are off by up to three times the spacing of numbers below 1.
@@ -28,11 +28,14 @@ def adapt_depth(
     scale_m: float | None = None,
     nothing: float | None = None,
     sky: float | None = None,
+    baseline_m: float | None = None,
 ) -> Tensor:
     """Returns depth along the optical axis, `[*B, 1, H, W]`, metres.
 
     Convention: `"z"` is depth along the optical axis and returned unchanged. `"ray_length"` is the
     distance from the camera's centre to the surface, metres (lidar, "distance to camera").
+    `"disparity"` is that of a rectified pair of cameras, in pixels of a picture of this size:
+    z = fx · baseline / disparity, so that 0 is inf and a negative one nan.
     `"z_buffer"` is OpenGL's depth buffer in [0, 1], 0 at `near_m` and 1 at `far_m` or where nothing
     was drawn. `"reversed_z_buffer"` is 1 at `near_m` and 0 at `far_m` or where nothing was drawn
     (MuJoCo's `mjDEPTH_ZEROFAR`, many game engines). Where nothing was drawn the result is inf; inf
@@ -40,16 +43,17 @@ def adapt_depth(
 
     Args:
         depth: `[*B, 1, H, W]`, of that `kind`.
-        kind: `"z"`, `"ray_length"`, `"z_buffer"` or `"reversed_z_buffer"`.
-        K: `[*B, 3, 3]`, pixels; only for `"ray_length"`.
+        kind: `"z"`, `"ray_length"`, `"disparity"`, `"z_buffer"` or `"reversed_z_buffer"`.
+        K: `[*B, 3, 3]`, pixels; only for `"ray_length"` and `"disparity"`.
         near_m: the near plane; only for the two buffers.
         far_m: the far plane, `math.inf` if the projection has none; only for the two buffers.
         scale_m: metres per unit of `depth`, 1 if it is float; whole numbers, such as uint16
-            millimetres (0.001), need it. Not for the two buffers.
+            millimetres (0.001), need it. Of disparity, pixels per unit. Not for the two buffers.
         nothing: a value, before scaling, that means missing depth; it becomes nan.
         sky: a value, before scaling, that means no surface. A positive value is a far plane: depth
             from 0.999 of it on becomes inf. Otherwise, depth up to the value becomes inf. Not for
             the two buffers.
+        baseline_m: the distance of the two cameras; only for `"disparity"`.
 
     Raises:
         ValueError: an argument that `kind` needs is missing, or one that it doesn't read is given.
@@ -58,8 +62,10 @@ def adapt_depth(
     tensor([[[1., 2., inf]]])
     >>> adapt_depth(torch.tensor([[[0, 2500]]]).short(), "z", scale_m=1e-3, nothing=0)
     tensor([[[   nan, 2.5000]]])
+    >>> adapt_depth(torch.tensor([[[8.0, 0.0]]]), "disparity", K=40 * torch.eye(3), baseline_m=0.1)
+    tensor([[[0.5000,    inf]]])
     """
-    check_depth_options(kind, K is not None, near_m, far_m, scale_m, sky)
+    check_depth_options(kind, K is not None, near_m, far_m, scale_m, sky, baseline_m)
     is_sky = None if sky is None else _is_sky(depth, sky)
     unmeasured = None if nothing is None else depth == nothing
     if scale_m is not None:
@@ -70,6 +76,11 @@ def adapt_depth(
     if is_sky is not None:
         depth = torch.where(is_sky, torch.inf, depth)
     check_shape("depth", depth, (1, "H", "W"))
+    if K is not None and baseline_m is not None:
+        check_shape("K", K, (3, 3))
+        common_batch(depth=depth.shape[:-3], K=K.shape[:-2])
+        focal_px = K[..., 0, 0].to(depth.dtype)[..., None, None, None]
+        return torch.where(depth < 0, torch.nan, focal_px * baseline_m / depth.abs())
     if K is not None:
         return z_from_ray_length(depth, K)
     if near_m is not None and far_m is not None:
@@ -146,13 +157,19 @@ def check_depth_options(
     far_m: float | None,
     scale_m: float | None = None,
     sky: float | None = None,
+    baseline_m: float | None = None,
 ) -> None:
     """Raises ValueError if an argument that `kind` needs is missing, or an unused one is given."""
     check_name("kind", kind, DepthKind)
-    if has_camera != (kind == "ray_length"):
+    if has_camera != (kind in ("ray_length", "disparity")):
         raise ValueError(
-            "'ray_length' needs K (AdaptDepth: intrinsics=), the other kinds do not read it; kind "
-            f"is {kind!r}"
+            "'ray_length' and 'disparity' need K (AdaptDepth: intrinsics=), the other kinds do not "
+            f"read it; kind is {kind!r}"
+        )
+    if (baseline_m is not None) != (kind == "disparity") or not (baseline_m or 1.0) > 0:
+        raise ValueError(
+            "'disparity' needs baseline_m, a positive number of metres, the other kinds do not "
+            f"read it; kind is {kind!r}, baseline_m={baseline_m}"
         )
     is_buffer = kind.endswith("z_buffer")
     planes = (near_m is not None) + (far_m is not None)

@@ -18,14 +18,18 @@ from flowrep.geometry.checks import check_name, check_shape, common_batch, first
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
+# The numbers of a pose in their order: xyz is the position, rotvec the rotation's axis times its
+# angle in radians (OpenCV's rvec), rotation its matrix row by row, four letters a unit quaternion.
 PoseLayout: TypeAlias = Literal[
-    "matrix", "matrix_3x4", "xyz_xyzw", "xyz_wxyz", "xyz_yaw", "xyz_yaw_pitch"
-]
+    "matrix", "matrix_3x4", "rotation_xyz", "xyz_xyzw", "xyz_wxyz", "xyzw_xyz", "wxyz_xyz",
+    "rotvec_xyz", "xyz_rotvec", "xyz_yaw", "xyz_yaw_pitch",
+]  # fmt: skip
 PoseDirection: TypeAlias = Literal["camera_to_world", "world_to_camera"]
 CameraAxes: TypeAlias = Literal["opencv", "opengl", "ned", "x_forward_z_up", "unreal", "unity"]
 
 POSE_SHAPES: dict[str, tuple[int, ...]] = {
-    "matrix": (4, 4), "matrix_3x4": (3, 4), "xyz_xyzw": (7,), "xyz_wxyz": (7,),
+    "matrix": (4, 4), "matrix_3x4": (3, 4), "rotation_xyz": (12,), "xyz_xyzw": (7,),
+    "xyz_wxyz": (7,), "xyzw_xyz": (7,), "wxyz_xyz": (7,), "rotvec_xyz": (6,), "xyz_rotvec": (6,),
     "xyz_yaw": (4,), "xyz_yaw_pitch": (5,),
 }  # fmt: skip
 
@@ -277,9 +281,11 @@ def adapt_pose(
 
     Args:
         pose: in the shape of its `layout`.
-        layout: `"matrix"` `[*B, 4, 4]`; `"matrix_3x4"`, without the last row; `"xyz_xyzw"` or
-            `"xyz_wxyz"` `[*B, 7]`, translation and unit quaternion, with the real part last or
-            first; `"xyz_yaw"` `[*B, 4]` or `"xyz_yaw_pitch"` `[*B, 5]`, translation and angles in
+        layout: `"matrix"` `[*B, 4, 4]`; `"matrix_3x4"`, without the last row; `"rotation_xyz"`
+            `[*B, 12]`, the rotation row by row and the translation; `"xyz_xyzw"`, `"xyz_wxyz"`,
+            `"xyzw_xyz"` or `"wxyz_xyz"` `[*B, 7]`, translation and unit quaternion, with the real
+            part last or first; `"rotvec_xyz"` or `"xyz_rotvec"` `[*B, 6]`, with a rotation vector
+            in radians; `"xyz_yaw"` `[*B, 4]` or `"xyz_yaw_pitch"` `[*B, 5]`, with angles in
             radians, in a world whose z is up: yaw from the world's x to its y, pitch upwards. With
             angles, the camera looks along its x axis (`axes="x_forward_z_up"` or `"unreal"`).
         direction: `"camera_to_world"` transforms points from camera to world coordinates;
@@ -298,8 +304,17 @@ def adapt_pose(
     """
     check_pose_options(layout, direction, axes)
     check_shape("pose", pose, POSE_SHAPES[layout])
-    if layout.startswith("matrix"):
-        matrix = pose.double() if layout == "matrix" else _with_last_row(pose.double())
+    if layout == "matrix":
+        matrix = pose.double()
+    elif layout == "matrix_3x4":
+        matrix = _with_last_row(pose.double())
+    elif layout == "rotation_xyz":
+        rotation, translation = pose.double().split([9, 3], -1)
+        matrix = _rigid(rotation.unflatten(-1, (3, 3)), translation)
+    elif "rotvec" in layout:
+        first, last = pose.double().split(3, -1)
+        vector, translation = (first, last) if layout == "rotvec_xyz" else (last, first)
+        matrix = _rigid(rotation_from_vector(vector), translation)
     elif layout.startswith("xyz_yaw"):
         matrix = _pose_from_angles(pose.double())
     else:
@@ -343,6 +358,10 @@ def _pose_from_angles(pose: Tensor) -> Tensor:
     return _with_last_row(torch.stack(rows, -1).unflatten(-1, (3, 4)))
 
 
+def _rigid(rotation: Tensor, translation: Tensor) -> Tensor:
+    return _with_last_row(torch.cat([rotation, translation.unsqueeze(-1)], -1))
+
+
 def _with_last_row(pose: Tensor) -> Tensor:
     """Returns `[*B, 4, 4]` from `[*B, 3, 4]`."""
     last = torch.zeros_like(pose[..., :1, :])
@@ -354,8 +373,8 @@ def pose_from_quaternion(pose: Tensor, layout: PoseLayout, *, check: bool = True
     """Returns the 4x4 matrix `[*B, 4, 4]`, float64, of a translation and a unit quaternion.
 
     Args:
-        pose: `[*B, 7]`, x, y, z in metres, then the quaternion.
-        layout: `"xyz_xyzw"` or `"xyz_wxyz"`.
+        pose: `[*B, 7]`, x, y, z in metres and the quaternion, in the order of the layout.
+        layout: `"xyz_xyzw"`, `"xyz_wxyz"`, `"xyzw_xyz"` or `"wxyz_xyz"`.
         check: whether a quaternion whose length differs from 1 by 0.001 raises ValueError; this
             waits for a GPU. Quaternions are normalised in either case.
 
@@ -367,15 +386,17 @@ def pose_from_quaternion(pose: Tensor, layout: PoseLayout, *, check: bool = True
     tensor([-1.,  0.,  0.,  1.], dtype=torch.float64)
     """
     check_shape("pose", pose, (7,))
-    translation, quaternion = pose.double().split([3, 4], -1)
+    first, last = layout.split("_")
+    parts = pose.double().split([len(first), len(last)], -1)
+    translation, quaternion = parts if first == "xyz" else parts[::-1]
     norm = quaternion.norm(dim=-1, keepdim=True)
     if check and not bool(((norm - 1.0).abs() < 1e-3).all()):
         raise ValueError(
             f"pose: a quaternion must have length 1, got {norm.flatten().tolist()[:8]}; "
-            f"layout {layout!r} reads x, y, z and then the quaternion"
+            f"layout {layout!r} says where it stands"
         )
     quaternion = quaternion / norm
-    x, y, z, w = (quaternion.roll(-1, -1) if layout == "xyz_wxyz" else quaternion).unbind(-1)
+    x, y, z, w = (quaternion.roll(-1, -1) if "wxyz" in layout else quaternion).unbind(-1)
     tx, ty, tz = translation.unbind(-1)
     rows = [
         *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), tx),

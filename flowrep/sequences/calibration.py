@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -11,14 +13,15 @@ import cv2
 import numpy as np
 import pydantic
 import torch
+import yaml
 from numpy.typing import NDArray
 
-from flowrep.geometry import CameraAxes, PoseDirection, PoseLayout, adapt_pose
-from flowrep.sequences.files import regular
+from flowrep.geometry import adapt_pose
+from flowrep.geometry.pose import POSE_SHAPES
+from flowrep.sequences.files import UNREADABLE, read_lines, regular
 from flowrep.sequences.recording import Pose, SequenceError
 
 Matrix: TypeAlias = NDArray[np.float64]
-StoredPoseLayout: TypeAlias = Literal["matrix", "xyz_xyzw", "xyz_wxyz", "xyzw_xyz"]
 Lens: TypeAlias = Literal["opencv", "fisheye"]
 
 MIRROR_REMEDY = (
@@ -49,20 +52,95 @@ class Camera(pydantic.BaseModel):
         return [self.fx, self.fy, self.cx + shift, self.cy + shift]
 
 
+# COLMAP's cameras.txt, https://colmap.github.io/cameras.html: the numbers of each lens model.
+_COLMAP = {
+    "SIMPLE_PINHOLE": "f cx cy", "PINHOLE": "fx fy cx cy", "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2", "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
+    "RADIAL_FISHEYE": "f cx cy k1 k2", "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+}  # fmt: skip
+# The names of the same numbers in files of ROS, OpenCV, Open3D and NeRF tools.
+_WIDTH, _HEIGHT = ("width", "image_width", "w"), ("height", "image_height", "h")
+_MATRIX = ("camera_matrix", "cameraMatrix", "intrinsic_matrix", "K", "k")
+_LENS = ("distortion_coefficients", "distortionCoefficients", "dist_coeffs", "D", "d")
+_FISHEYE = ("equidistant", "fisheye", "OPENCV_FISHEYE")
+FILES = (".json", ".yaml", ".yml", "cameras.txt")
+
+
 def read_camera(path: Path) -> Camera:
-    """Returns the content of an `intrinsics.json`."""
+    """Returns the camera of an `intrinsics.json`, or of another tool's file.
+
+    These are COLMAP's `cameras.txt`, a YAML of ROS or OpenCV, a JSON of Open3D, and NeRF's
+    `transforms.json`.
+    """
     remedy = (
         'it holds {"width": .., "height": .., "fx": .., "fy": .., "cx": .., "cy": .., '
         '"first_pixel_centre": 0 (as OpenCV calibrates) or 0.5} and, of a lens that bends the '
         'picture, "distortion" and "lens"'
     )
     try:
-        return Camera.model_validate_json(regular(path).read_text("utf-8-sig", "replace"))
+        text = regular(path).read_text("utf-8-sig", "replace")
+        if path.name.endswith(".txt"):
+            given = _colmap(path)
+        elif path.suffix == ".json":
+            given = json.loads(text)
+        else:  # OpenCV begins with a directive and names types that YAML doesn't know
+            given = yaml.safe_load(re.sub(r"^%.*|!!opencv-matrix", "", text, flags=re.MULTILINE))
+        return Camera.model_validate(_renamed(given) if isinstance(given, dict) else given)
     except FileNotFoundError:
         raise SequenceError(path, f"no such file; {remedy}") from None
     except pydantic.ValidationError as error:
         lines = [f"{'.'.join(map(str, e['loc']))} {e['msg']}".strip() for e in error.errors()]
         raise SequenceError(path, f"{', '.join(lines)}; {remedy}") from None
+    except (*UNREADABLE, yaml.YAMLError) as error:
+        says = f"is no {path.suffix[1:].upper()}: {' '.join(str(error).split())}"
+        raise SequenceError(path, f"{says}; {remedy}") from None
+
+
+def _colmap(path: Path) -> dict[str, Any]:
+    cameras = [line.split() for line in read_lines(path)]
+    if len(cameras) != 1 or len(cameras[0]) < 5:
+        remedy = "make one of all pictures, with --ImageReader.single_camera 1"
+        raise SequenceError(path, f"holds {len(cameras)} cameras: {remedy}")
+    _, model, width, height, *numbers = cameras[0]
+    if model not in _COLMAP:
+        raise SequenceError(
+            path, f"has the lens {model}; of COLMAP's, read are {', '.join(_COLMAP)}"
+        )
+    named = dict(zip(_COLMAP[model].split(), map(float, numbers), strict=True))
+    lens = "OPENCV_FISHEYE" if model.endswith("FISHEYE") else "OPENCV"
+    return {"w": int(width), "h": int(height), "fl_x": named.get("f"), "camera_model": lens} | named
+
+
+def _renamed(given: dict[str, Any]) -> dict[str, Any]:
+    """Returns the numbers of another tool's file by this project's names."""
+
+    def of(names: Sequence[str]) -> Any:
+        value = next((given[name] for name in names if given.get(name) is not None), None)
+        return value.get("data") if isinstance(value, dict) else value
+
+    camera = {"width": of(_WIDTH), "height": of(_HEIGHT), "first_pixel_centre": 0.0}
+    if of(_MATRIX) is not None:
+        K = camera_matrix(of(_MATRIX), (1, 1), 0.5)
+        numbers, coefficients = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]], of(_LENS) or []
+    elif {"fl_x", "camera_angle_x"} & {*given}:  # of NeRF tools and COLMAP: centres at halves
+        camera["first_pixel_centre"] = 0.5
+        width, height = (size or math.nan for size in (camera["width"], camera["height"]))
+        fx = of(("fl_x", "fx")) or width / 2 / math.tan(given["camera_angle_x"] / 2)
+        centre = given.get("cx", width / 2), given.get("cy", height / 2)
+        numbers = [fx, of(("fl_y", "fy")) or fx, *centre]
+        order = ["k1", "k2", "k3", "k4"]
+        if given.get("camera_model") not in _FISHEYE:
+            order = ["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"][: 8 if "k4" in given else 5]
+        coefficients = [given.get(name, 0.0) for name in order]
+    else:
+        return given
+    camera |= dict(zip(("fx", "fy", "cx", "cy"), map(float, numbers)))
+    if any(coefficients):
+        model = {given.get("distortion_model"), given.get("camera_model")}
+        camera |= {"distortion": list(map(float, coefficients))}
+        camera |= {"lens": "fisheye" if model & {*_FISHEYE} else "opencv"}
+    return camera
 
 
 def camera_matrix(
@@ -95,32 +173,32 @@ def camera_matrix(
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     else:
         K = values.reshape(4 if len(values) == 16 else 3, -1)[:3, :3]
+        if K[2].tolist() != [0, 0, 1] and K[:, 2].tolist() == [0, 0, 1]:  # written by columns
+            K = K.T.copy()
     if K[1, 1] < 0:
         raise SequenceError(source, MIRROR_REMEDY)
     K[:2, 2] += 0.5 - first_pixel_centre
     return K
 
 
-def as_pose(
-    numbers: NDArray[np.float64],
-    source: object,
-    *,
-    layout: StoredPoseLayout = "matrix",
-    direction: PoseDirection = "camera_to_world",
-    axes: CameraAxes = "opencv",
-) -> Pose:
-    """Returns `world_from_cam` `[*B, 4, 4]` from the 7, 12 or 16 numbers of each pose."""
+def as_pose(numbers: NDArray[np.float64], source: object, **options: Any) -> Pose:
+    """Returns `world_from_cam` `[*B, 4, 4]` from the numbers of each pose, side by side.
+
+    A matrix may lack its last row. The options are those of `flowrep.geometry.adapt_pose`.
+    """
     values = torch.from_numpy(np.array(numbers, dtype=np.float64))
-    given: PoseLayout = "xyz_xyzw" if layout == "xyzw_xyz" else layout
-    if layout == "matrix":
-        if values.shape[-1] not in (12, 16):
-            raise SequenceError(source, f"has {values.shape[-1]} numbers, a matrix has 12 or 16")
-        values = values.unflatten(-1, (-1, 4))
-        given = "matrix" if values.shape[-2] == 4 else "matrix_3x4"
-    elif layout == "xyzw_xyz":
-        values = values.roll(3, -1)
+    layout, count = options.pop("layout", "matrix"), values.shape[-1]
+    if layout == "matrix" and count == 12:
+        layout = "matrix_3x4"
+    if count != math.prod(POSE_SHAPES[layout]):
+        fitting = [name for name, shape in POSE_SHAPES.items() if math.prod(shape) == count]
+        remedy = (
+            f"give format.pose_layout={' or '.join(fitting)}" if fitting else "no pose has so many"
+        )
+        raise SequenceError(source, f"has {count} numbers a pose: {remedy}")
     try:
-        pose: Pose = adapt_pose(values, layout=given, direction=direction, axes=axes).numpy()
+        values = values.unflatten(-1, POSE_SHAPES[layout])
+        pose: Pose = adapt_pose(values, layout=layout, **options).numpy()
     except ValueError as error:
         raise SequenceError(source, str(error)) from None
     return pose

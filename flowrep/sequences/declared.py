@@ -21,7 +21,7 @@ from flowrep.config.schema import check_reader_options
 from flowrep.sequences import calibration, files
 from flowrep.sequences.calibration import as_pose, camera_matrix
 from flowrep.sequences.kitti import Kitti
-from flowrep.sequences.recording import Frame, Pose, Recording, SequenceError, Stream
+from flowrep.sequences.recording import Frame, Pose, Recording, SequenceError
 from flowrep.sequences.video import VIDEOS, StillVideo, VideoPictures
 from flowrep.usage import closest_first
 
@@ -59,8 +59,9 @@ class DeclaredRecording(Recording):
     camera: str | int | None
     render: str | None
     depth_by: Literal["name", "order", "time"]
-    rows_by: Literal["order", "number", "time"]
+    rows_by: Literal["order", "number", "time", "name"]
     key_column: int
+    names: str | None
     rows_where: Sequence[int | str] | None
     pose_columns: Sequence[int] | None
     intrinsics_columns: Sequence[int] | None
@@ -71,9 +72,10 @@ class DeclaredRecording(Recording):
     pose_lag_frames: int
     leave_out: Sequence[str]
     backwards: bool
-    pose_layout: calibration.StoredPoseLayout
+    pose_layout: geometry.PoseLayout
     pose_direction: geometry.PoseDirection
     pose_axes: geometry.CameraAxes
+    pose_unit_m: float
     marker_from_cam: Sequence[float] | None
     first_pixel_centre: float
     distortion: Sequence[float]
@@ -83,6 +85,7 @@ class DeclaredRecording(Recording):
     depth_kind: geometry.DepthKind
     near_m: float | None
     far_m: float | None
+    baseline_m: float | None
     depth_coding: files.DepthCoding | None
     depth_missing: Sequence[int]
     depth_no_surface: int | None
@@ -95,9 +98,6 @@ class DeclaredRecording(Recording):
 
     def __post_init__(self) -> None:
         self.folder = Path(self.folder)
-        # Not ???, which would not replace the value of the format that this one extends.
-        for key in [key for key, value in vars(self).items() if value == "needed"]:
-            raise ValueError(f"format.{key} needs a value: format.{key}=...")
         if self.depth_unit_m is not None and not self.depth_unit_m > 0:
             raise ValueError(f"depth_unit_m must be positive, got {self.depth_unit_m}")
         self.has_flow, self.no_flow = self._flow_fits()
@@ -226,41 +226,50 @@ class DeclaredRecording(Recording):
         self, pattern: str, columns: Sequence[int] | None
     ) -> tuple[Floats, Indices, Indices, Floats]:
         """Returns a table's columns, the rows before and after each frame (-1: none), the share."""
-        path, is_keyed = self._path(pattern), "*" not in pattern and self.rows_by != "order"
-        if "*" in pattern:
+        path, by = self._path(pattern), self.rows_by
+        keys: Any = None  # None: the rows are in the frames' order
+        if "*" in pattern.partition(":")[0]:
             paths = [self._file(pattern, "numbers", name) for name in self._names]
             each = [files.read_table(path).ravel() for path in paths]
             for path, numbers in zip(paths, each):
                 if len(numbers) != len(each[0]):
                     raise SequenceError(path, f"has {len(numbers)} numbers, others {len(each[0])}")
             table = np.stack(each)
+        elif by == "name" and self.names is None:
+            keys, table = files.read_named_rows(path, self.key_column)
         else:
             table = files.read_table(path)
-        if self.rows_where is not None:
-            column, value = map(str, self.rows_where)
-            table = table[_column(path, table, int(column)) == float(self._path(value).name)]
-        first, end = columns or (self.key_column + 1 if is_keyed else 0, table.shape[1])
+            if self.rows_where is not None:
+                column, value = map(str, self.rows_where)
+                table = table[_column(path, table, int(column)) == float(self._path(value).name)]
+            if by == "name":
+                keys = files.read_names(self._path(self.names or ""))
+            elif by != "order":
+                keys = _column(path, table, self.key_column)
+        after_key = 0 if keys is None or by == "name" else self.key_column + 1
+        first, end = columns or (after_key, table.shape[1])
         if not len(table) or not first < end <= table.shape[1]:
             size = f"{len(table)} rows of {table.shape[1]}"
             raise SequenceError(path, f"has {size} numbers, expected {max(end, first + 1)}")
         before = after = np.arange(len(self._names))
         share = np.zeros(len(before))
-        if is_keyed and self._times_s is not None and self.rows_by == "time":
-            keys = _column(path, table, self.key_column)
-            times_s = _ascending(path, keys * self.time_unit_s)
-            times_s = times_s + self.pose_offset_s
+        if keys is None:
+            if len(table) != len(before):
+                raise SequenceError(path, f"has {len(table)} rows for {len(before)} frames")
+        elif by == "time" and self._times_s is not None:
+            times_s = _ascending(path, keys * self.time_unit_s) + self.pose_offset_s
             before = after = nearest(times_s, self._times_s, self.tolerance_s)
             if self.interpolate:
                 before, after, share = between(times_s, self._times_s, self.tolerance_s)
-        elif is_keyed:
-            keys = _column(path, table, self.key_column)
-            row_of = {key: row for row, key in enumerate(keys.tolist())}
-            if len(row_of) < len(keys) or not np.isfinite(keys).all():
-                says = "has two rows with the same frame number, or one that is nan or inf"
+        else:
+            key_of = _plain if by == "name" else _number
+            row_of = {_plain(key) if by == "name" else key: row for row, key in enumerate(keys)}
+            if len(keys) != len(table):
+                raise SequenceError(path, f"has {len(table)} rows, and {len(keys)} {by}s")
+            if len(row_of) < len(table) or (by != "name" and not np.isfinite(keys).all()):
+                says = f"has two rows with the same {by}, or one that is nan or inf"
                 raise SequenceError(path, f"{says}; select rows with format.rows_where")
-            before = after = np.array([row_of.get(_number(name), -1) for name in self._names])
-        elif len(table) != len(before):
-            raise SequenceError(path, f"has {len(table)} rows for {len(before)} frames")
+            before = after = np.array([row_of.get(key_of(name), -1) for name in self._names])
         return table[:, first:end], before, after, share
 
     def _read_poses(self) -> LeftOut:
@@ -269,21 +278,16 @@ class DeclaredRecording(Recording):
             return {}
         path = self._path(self.poses)
         numbers, before, after, share = self._rows(self.poses, self.pose_columns)
-        width = numbers.shape[1]
-        if width not in ((12, 16) if self.pose_layout == "matrix" else (7,)):
-            fitting = {7: "xyz_xyzw or xyz_wxyz", 12: "matrix", 16: "matrix"}.get(width)
-            remedy = f"give format.pose_layout={fitting}" if fitting else "expected 7, 12 or 16"
-            raise SequenceError(path, f"has {width} numbers a pose: {remedy}")
-        turns = numbers[:, :4] if self.pose_layout == "xyzw_xyz" else numbers[:, 3:7]
-        if self.pose_layout == "matrix":
-            turns = numbers.reshape(len(numbers), -1, 4)[:, :3, :3].reshape(-1, 9)
-        lost = ~np.isfinite(numbers).all(1) | (turns == 0).all(1)
+        options: Any = {"layout": self.pose_layout, "direction": self.pose_direction}
+        options["axes"] = self.pose_axes
+        poses = as_pose(numbers, path, check=False, **options)
+        lost = ~np.isfinite(poses).all((1, 2)) | (poses[:, :3, :3] == 0).all((1, 2))
         if not lost.all():
             numbers[lost] = numbers[~lost][0]  # so that errors name the wrong row
-            options: Any = {"direction": self.pose_direction, "axes": self.pose_axes}
-            poses = as_pose(numbers, path, layout=self.pose_layout, **options)
+            poses = as_pose(numbers, path, **options)
+            poses[:, :3, 3] *= self.pose_unit_m
             if self.marker_from_cam is not None:
-                fixed: Any = "xyz_xyzw" if len(self.marker_from_cam) == 7 else "matrix"
+                fixed = "xyz_xyzw" if len(self.marker_from_cam) == 7 else "matrix"
                 marker = np.array(self.marker_from_cam)
                 poses @= as_pose(marker, "marker_from_cam", layout=fixed)
         lacking, lag = before < 0, max(-len(lost), min(self.pose_lag_frames, len(lost)))
@@ -302,7 +306,7 @@ class DeclaredRecording(Recording):
         """Reads the numbers of K, and of depth's camera if it is another."""
         self._size = None
         source = self._path(self.intrinsics) if isinstance(self.intrinsics, str) else "intrinsics"
-        if isinstance(self.intrinsics, str) and self.intrinsics.endswith(".json"):
+        if isinstance(self.intrinsics, str) and self.intrinsics.endswith(calibration.FILES):
             camera = calibration.read_camera(self._path(self.intrinsics))
             self._size = camera.height, camera.width  # of the camera of K
             self.intrinsics, self.first_pixel_centre = camera.numbers, 0.5
@@ -377,8 +381,8 @@ class DeclaredRecording(Recording):
             rgb = cv2.resize(rgb, size[::-1], interpolation=cv2.INTER_AREA)
         if self._depth_numbers is not None:
             K_depth = camera_matrix(self._depth_numbers, depth.shape, self.first_pixel_centre)
-        options: Any = {"near_m": self.near_m, "far_m": self.far_m}
-        if self.depth_kind == "ray_length":
+        options: Any = {name: getattr(self, name) for name in ("near_m", "far_m", "baseline_m")}
+        if self.depth_kind in ("ray_length", "disparity"):
             options["K"] = torch.from_numpy(K_depth).float()
         stored = torch.from_numpy(depth)[None]
         depth = geometry.adapt_depth(stored, self.depth_kind, **options)[0].numpy()
@@ -451,6 +455,12 @@ def _number(name: str) -> int:
     return int(digits[0]) if digits else -1
 
 
+def _plain(name: str) -> str:
+    """Returns a frame's name without folder, suffix and leading zeros: images/007.png is 7."""
+    stem = Path(name).stem if Path(name).suffix.lower() in files.PICTURES else Path(name).name
+    return stem.lstrip("0") or "0"
+
+
 def _column(path: Path, table: Floats, number: int) -> Floats:
     if not 0 <= number < table.shape[1]:
         raise SequenceError(path, f"has {table.shape[1]} columns, and none of number {number}")
@@ -494,7 +504,7 @@ def interpolated_pose(before: Pose, after: Pose, share: float) -> Pose:
     return pose
 
 
-READERS: dict[str, type[Stream]] = {
+READERS: dict[str, Any] = {
     reader.__name__: reader for reader in (DeclaredRecording, Kitti, StillVideo)
 }
 
@@ -517,7 +527,7 @@ def open_recording(folder: str | Path, format: str, **options: Any) -> Recording
         there = closest_first(format, group_choices("format"))
         raise SequenceError(f"format={format}", f"is unknown; there are: {there}")
     keys = declaration(format) | options
-    reader: Any = READERS[keys.pop("_target_").rpartition(".")[2]]
+    reader = READERS[keys.pop("_target_").rpartition(".")[2]]
     check_reader_options(reader, keys)
     recording: Recording = reader(folder, **keys)
     if isinstance(recording, DeclaredRecording):

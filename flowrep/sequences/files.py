@@ -28,13 +28,16 @@ DepthCoding: TypeAlias = Literal["float32_rgba", "rgb24"]
 FlowCoding: TypeAlias = Literal["kitti", "vkitti2", "kubric"]
 FlowMap: TypeAlias = NDArray[np.float32]  # [2, H, W], u right, v down; nan where unknown
 
+PICTURES = (".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".bmp", ".tif", ".tiff", ".npy")
+_HDF5 = (".flo5", ".dsp5", ".hdf5", ".h5")  # the first two are Spring's
 _SUFFIXES = {
-    "picture": (".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".bmp", ".tif", ".tiff", ".npy"),
-    "map": (".png", ".npy", ".tif", ".tiff", ".pgm", ".pfm", ".exr", ".dpt"),
-    "flow": (".flo", ".png", ".npy", ".pfm", ".flo5"),
-    "numbers": (".txt", ".csv", ".json", ".cam"),
+    "picture": PICTURES,
+    "map": (".png", ".npy", ".tif", ".tiff", ".pgm", ".pfm", ".exr", ".dpt", *_HDF5),
+    "flow": (".flo", ".png", ".npy", ".pfm", *_HDF5),
+    "numbers": (".txt", ".csv", ".json", ".cam", ".pincam"),
 }
 FLO_TAG = 202021.25
+UNREADABLE = (ValueError, LookupError, TypeError, ArithmeticError, RecursionError, struct.error)
 # More is no frame and no table, but a mistake or a bomb: a small file may ask for all memory.
 _MOST_BYTES, _MOST_PIXELS = 1 << 30, 100_000_000
 _FLO_UNKNOWN, _FLO_LARGEST = 1e10, 1e9  # written for unknown flow; larger values are unknown
@@ -109,33 +112,72 @@ def read_table(path: Path) -> NDArray[np.float64]:
     """Returns the numbers of a file, a row a line.
 
     They are separated by blanks or commas; a line that begins with a word is a header. Of JSON,
-    `path` ends in `file.json:key.key`; the numbers of several keys, with `+` between them, stand
-    side by side. Sintel's `.cam` is one row, K and the extrinsics.
+    `path` ends in `file.json:key.key`, with `*` for each item of a list or value of an object; the
+    numbers of several keys, with `+` between them, stand side by side. Sintel's `.cam` is one row,
+    K and the extrinsics; a pose of Open3D's `.log` is four lines after one of other numbers.
     """
     name, _, keys = path.name.partition(":")
     path = path.with_name(name)
     try:
         if path.suffix.lower() == ".json":
-            parts, whole = [], json.loads(regular(path).read_bytes())
-            for steps in keys.split("+"):
-                value = whole
-                for step in steps.split("."):
-                    value = value[int(step)] if isinstance(value, list) else value[step]
-                parts.append(np.array(value, dtype=np.float64))
-            table = np.hstack([part if part.ndim == 2 else part.reshape(-1, 1) for part in parts])
+            whole = json.loads(regular(path).read_bytes())
+            parts = [np.array(_found(whole, k.split(".")), np.float64) for k in keys.split("+")]
+            table = np.hstack([p.reshape(len(p) if p.ndim > 1 else p.size, -1) for p in parts])
         elif path.suffix.lower() == ".cam":
             tag, *row = struct.unpack("<f21d", regular(path).read_bytes())
             table = np.array([row] if tag == FLO_TAG else [])
         else:
             lines = [line.replace(",", " ") for line in read_lines(path)]
+            if path.suffix.lower() == ".log":
+                lines = [" ".join(lines[i + 1 : i + 5]) for i in range(0, len(lines), 5)]
             if lines and not re.match(r"[-+.]?(\d|nan|inf)", lines[0], re.IGNORECASE):
                 del lines[0]
             table = np.loadtxt(lines, ndmin=2) if lines else np.empty(0)
-    except (ValueError, LookupError, TypeError, ArithmeticError, RecursionError, struct.error) as e:
-        raise SequenceError(path, f"holds no table of numbers {keys}: {e!r}") from None
+    except UNREADABLE as error:
+        raise SequenceError(path, f"holds no table of numbers {keys}: {error!r}") from None
     if not table.size:
         raise SequenceError(path, "holds no numbers")
     return table
+
+
+def _found(value: Any, steps: list[str]) -> Any:
+    """Returns what a JSON holds at a path; a last `*` gives an object's keys."""
+    if not steps:
+        return value
+    step, *rest = steps
+    if step == "*" and rest:
+        return [_found(v, rest) for v in (value.values() if isinstance(value, dict) else value)]
+    if step == "*":
+        return [*value]
+    return _found(value[int(step)] if isinstance(value, list) else value[step], rest)
+
+
+def read_names(path: Path) -> list[str]:
+    """Returns the texts of a JSON at a path, see `read_table`."""
+    name, _, keys = path.name.partition(":")
+    path = path.with_name(name)
+    try:
+        return [str(x) for x in _found(json.loads(regular(path).read_bytes()), keys.split("."))]
+    except UNREADABLE as error:
+        raise SequenceError(path, f"holds no list of names {keys}: {error!r}") from None
+
+
+def read_named_rows(path: Path, column: int) -> tuple[list[str], NDArray[np.float64]]:
+    """Returns the names in a column and the other numbers of each line.
+
+    A line without a name there is skipped, such as COLMAP's lines of points.
+    """
+    names, rows = [], []
+    for line in read_lines(path):
+        words = line.replace(",", " ").split()
+        if len(words) > column and not re.fullmatch(r"[-+.\deE]+|nan|inf", words[column]):
+            names.append(words.pop(column))
+            rows.append(words)
+    try:
+        return names, np.array(rows, dtype=np.float64).reshape(len(rows), -1)
+    except UNREADABLE as error:
+        says = f"holds no numbers beside names in column {column}: {error!r}"
+        raise SequenceError(path, says) from None
 
 
 def read_array(path: Path) -> NDArray[Any]:
@@ -155,8 +197,8 @@ def read_array(path: Path) -> NDArray[Any]:
                 array = values.reshape(height, width, 2 if suffix == ".flo" else 1)
         elif suffix == ".exr":
             array = _read_exr(path)
-        elif suffix == ".flo5":
-            raise SequenceError(path, "is HDF5, which isn't read: convert it to .flo or .npy")
+        elif suffix in _HDF5:
+            array = _read_hdf5(path)
         else:
             array = _decoded(path, regular(path).read_bytes())
     except (ValueError, EOFError, RuntimeError, struct.error, cv2.error, _Bomb) as error:
@@ -191,6 +233,24 @@ def _read_exr(path: Path) -> NDArray[Any]:
     name = min(planes, key=lambda name: (f"ZRYV{name[-1]}".index(name[-1]), name))
     pixels: NDArray[Any] = planes[name].pixels
     return pixels
+
+
+def _read_hdf5(path: Path) -> NDArray[Any]:
+    """Returns the only array of a file."""
+    require(f"reading {path.suffix}", "hdf5", "h5py")
+    import h5py
+
+    arrays: dict[str, Any] = {}
+    try:
+        with h5py.File(regular(path)) as file:
+            file.visititems(lambda name, x: arrays.update({name: x} if hasattr(x, "shape") else {}))
+            if len(arrays) != 1:
+                raise SequenceError(path, f"holds {len(arrays)} arrays, not one: {[*arrays][:8]}")
+            (stored,) = arrays.values()
+            check_size(path, *stored.shape)
+            return np.array(stored)
+    except OSError as error:  # which doesn't name the file
+        raise SequenceError(path, f"can't be read as HDF5: {error}") from None
 
 
 def read_rgb(path: Path) -> NDArray[np.uint8]:

@@ -39,7 +39,7 @@ class AdaptDepth(CameraTransform):
     Convention and further arguments: see `flowrep.geometry.adapt_depth`.
 
     Args:
-        intrinsics: K `[3, 3]` in pixels or its key; only for `"ray_length"`.
+        intrinsics: K `[3, 3]` in pixels or its key; only for `"ray_length"` and `"disparity"`.
         channels_last: whether the env's depth is `[*B, H, W, 1]`.
 
     Raises:
@@ -65,17 +65,20 @@ class AdaptDepth(CameraTransform):
         scale_m: float | None = None,
         nothing: float | None = None,
         sky: float | None = None,
+        baseline_m: float | None = None,
         channels_last: bool = False,
         in_keys: Keys = "depth",
         out_keys: Keys = ("sensor", "depth"),
     ) -> None:
-        check_depth_options(kind, intrinsics is not None, near_m, far_m, scale_m, sky)
+        has_camera = intrinsics is not None
+        check_depth_options(kind, has_camera, near_m, far_m, scale_m, sky, baseline_m)
         shape = ("H", "W", 1) if channels_last else base.DEPTH.shape
         reads = Reads(shape, "float" if scale_m is None else "any")
         super().__init__(intrinsics, [reads], in_keys, out_keys)
         check_distinct_keys(self)
         self.options: dict[str, Any] = {"kind": kind, "near_m": near_m, "far_m": far_m}
         self.options |= {"scale_m": scale_m, "nothing": nothing, "sky": sky}
+        self.options["baseline_m"] = baseline_m
         self.channels_last = channels_last
 
     def compute(self, depth: Tensor, K: Tensor | None = None) -> tuple[Tensor]:

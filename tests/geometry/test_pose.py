@@ -212,6 +212,8 @@ def test_a_body_in_a_left_handed_world_moves_as_it_did(axes):
 def test_a_pose_without_its_last_row():
     whole = torch.tensor([[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1.0]])
     assert g.adapt_pose(whole[:3], layout="matrix_3x4").equal(whole.double())
+    apart = torch.cat([whole[:3, :3].flatten(), whole[:3, 3]])
+    assert g.adapt_pose(apart, layout="rotation_xyz").equal(whole.double())
     inverted = g.adapt_pose(whole[:3], layout="matrix_3x4", direction="world_to_camera")
     torch.testing.assert_close(inverted @ whole.double(), torch.eye(4).double())
 
@@ -236,13 +238,21 @@ def test_angles_turn_left_and_look_up():
     torch.testing.assert_close(level[:3, 2], torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
 
 
-@pytest.mark.parametrize("layout", ["xyz_xyzw", "xyz_wxyz"])
+TURNS = ("xyz_xyzw", "xyz_wxyz", "xyzw_xyz", "wxyz_xyz", "xyz_rotvec", "rotvec_xyz")
+
+
+@pytest.mark.parametrize("layout", TURNS)
 @pytest.mark.parametrize(("axis", "moves", "to"), [(0, 1, 2), (1, 2, 0), (2, 0, 1)])
-def test_a_quaternion_of_a_quarter_turn_about_each_axis(axis, moves, to, layout):
+def test_a_quarter_turn_about_each_axis(axis, moves, to, layout):
     # cos 45 and sin 45 degrees about the axis. About z, xyzw read as wxyz would turn about y.
-    real, first = (6, 3) if layout == "xyz_xyzw" else (3, 4)
-    pose = torch.tensor([1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 0.0])
-    pose[real] = pose[first + axis] = math.sqrt(0.5)
+    turn = [0.0, 0.0, 0.0]
+    turn[axis] = math.pi / 2 if "rotvec" in layout else math.sqrt(0.5)
+    if "xyzw" in layout:
+        turn = [*turn, math.sqrt(0.5)]
+    elif "wxyz" in layout:
+        turn = [math.sqrt(0.5), *turn]
+    place = [1.0, 2.0, 3.0]
+    pose = torch.tensor([*place, *turn] if layout.startswith("xyz_") else [*turn, *place])
     matrix = g.adapt_pose(pose, layout=layout)
     unit = torch.eye(4).double()
     torch.testing.assert_close(matrix @ unit[moves], unit[to], atol=1e-6, rtol=0)

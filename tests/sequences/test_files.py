@@ -128,7 +128,7 @@ MISTAKES = [
     ("frames", "poses.txt", [3 * "nan nan nan 0 " + "0 0 0 1"] * 3, "nan"),
     ("frames", "poses.txt", ["2 0 0 0 0 2 0 0 0 0 2 0 0 0 0 1"] * 3, "not rigid"),
     ("frames", "poses.txt", ["1 0 0 0 0 1 0 0 0 0 -1 0 0 0 0 1"] * 3, "left-handed"),
-    ("frames", "poses.txt", ["1 0 0"] * 3, "expected 7, 12"),
+    ("frames", "poses.txt", ["1 0 0"] * 3, "3 numbers a pose"),
     ("frames", "poses.txt", ["0 0 0 0 0 0 1"] * 3, "pose_layout=xyz_xyzw"),
     ("frames", "poses.txt", ["# nothing"], "no numbers"),
     ("frames", "poses.txt", [POSE] * 2, "2 rows for 3 frames"),
@@ -142,7 +142,7 @@ MISTAKES = [
     ("frames", "intrinsics.json", ["{"], "JSON"),
     ("tum", "rgb.txt", ["2.0 rgb/b.png", "1.0 rgb/a.png"], "backwards"),
     ("tum", "groundtruth.txt", ["2 0 0 0 0 0 0 1", "1 0 0 0 0 0 0 1"], "backwards"),
-    ("tum", "groundtruth.txt", ["1.0 0 0 0"], "expected 7, 12"),
+    ("tum", "groundtruth.txt", ["1.0 0 0 0"], "3 numbers a pose"),
     ("tum", "depth.txt", ["1.0"], "<time> <file>"),
     ("tum", "depth.txt", ["# none"], "depth.txt"),
     ("tum", "depth.txt", ["1 depth/a.png", "2 depth/a.png"], "same name"),
@@ -251,11 +251,22 @@ def test_a_pipe_is_refused_and_not_waited_for(name, tmp_path):
         signal.signal(signal.SIGALRM, previous)
 
 
-def test_flo5_is_named_as_what_it_is(tmp_path):
-    synthetic.write_frames(tmp_path)
-    (tmp_path / "flow/0001.flo").rename(tmp_path / "flow/0001.flo5")
-    says = refusal(lambda: sequences.open_recording(tmp_path, "frames"), "0001.flo5")
-    assert ".flo" in says
+def test_an_hdf5_file_is_its_only_array(tmp_path):
+    h5py = pytest.importorskip("h5py", reason="pip install 'flowrep-rl[hdf5]'")
+    moments = synthetic.write_frames(tmp_path)
+    u_and_v, depth = moments[1].raw.transpose(1, 2, 0), moments[1].depth
+    for file, key, array in (("flow/0001.flo5", "flow", u_and_v), ("depth/0001.h5", "a/z", depth)):
+        next(tmp_path.glob(f"{file.partition('.')[0]}.*")).unlink()
+        with h5py.File(tmp_path / file, "w") as stored:
+            stored[key] = array
+    frame = sequences.open_recording(tmp_path, "frames")[1]
+    np.testing.assert_array_equal(frame.raw, moments[1].raw)
+    np.testing.assert_array_equal(frame.depth, depth)
+    with h5py.File(tmp_path / "depth/0001.h5", "a") as stored:
+        stored["b"] = array
+    assert "2 arrays" in refusal(lambda: sequences.open_recording(tmp_path, "frames"), "0001.h5")
+    (tmp_path / "depth/0001.h5").write_bytes(b"no HDF5")
+    refusal(lambda: sequences.open_recording(tmp_path, "frames"), "0001.h5")
 
 
 @pytest.mark.parametrize(

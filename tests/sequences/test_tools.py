@@ -1,0 +1,187 @@
+"""Poses and calibrations as other tools write them, by their documentation."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cv2", reason="recordings need OpenCV")
+
+from scipy.spatial.transform import Rotation
+
+from flowrep.sequences import SequenceError, open_recording
+from tests.sequences import synthetic
+from tests.sequences.synthetic import HEIGHT, WIDTH, K, make_moments, numbers, put, stored
+
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+OPENCV_K = synthetic.OPENCV_K
+
+
+def inverse(moment):
+    """Rotation and position of the world in the camera."""
+    pose = np.linalg.inv(moment.world_from_cam)
+    return Rotation.from_matrix(pose[:3, :3]), pose[:3, 3]
+
+
+def write_colmap(folder, moments):
+    images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "#   POINTS2D[]"]
+    for i in (2, 0, 1):  # unordered
+        rotation, position = inverse(moments[i])
+        x, y, z, w = rotation.as_quat()
+        images += [f"{i + 5} {numbers([w, x, y, z, *position])} 1 {i:04d}.png"]
+        images += ["" if i == 0 else "1.5 2.5 -1 " * 6]  # a line of points, which may be empty
+    put(folder / "sparse/images.txt", images)
+    camera = f"1 PINHOLE {WIDTH} {HEIGHT} 31 27 18.5 13"
+    put(folder / "sparse/cameras.txt", ["# CAMERA_ID, MODEL", camera])
+
+
+def write_nerf(folder, moments):
+    frames = [
+        {
+            "file_path": f"./images/{i:04d}.png",
+            "transform_matrix": (m.world_from_cam @ OPENGL).tolist(),
+        }
+        for i, m in enumerate(moments)
+    ][::-1]
+    camera = {"fl_x": 31, "fl_y": 27, "cx": 18.5, "cy": 13, "w": WIDTH, "h": HEIGHT, "k1": 0.0}
+    put(folder / "transforms.json", [json.dumps(camera | {"frames": frames})])
+
+
+def write_bop(folder, moments):
+    scene = {}
+    for i, moment in enumerate(moments):
+        rotation, position = inverse(moment)
+        camera = {"cam_K": OPENCV_K.ravel().tolist(), "depth_scale": 1.0}
+        camera["cam_R_w2c"] = rotation.as_matrix().ravel().tolist()
+        scene[str(i)] = camera | {"cam_t_w2c": (1000 * position).tolist()}
+    put(folder / "scene_camera.json", [json.dumps(scene)])
+
+
+def write_arkitscenes(folder, moments):
+    lines = []
+    for i, moment in enumerate(moments):
+        rotation, position = inverse(moment)
+        lines.append(f"{100 + i / 60:.3f} {numbers([*rotation.as_rotvec(), *position])}")
+        pincam = f"{WIDTH} {HEIGHT} 31 27 18.5 13"
+        put(folder / f"lowres_wide_intrinsics/7_{100 + i / 60:.3f}.pincam", [pincam])
+    put(folder / "lowres_wide.traj", lines)
+
+
+def write_open3d(folder, moments):
+    log = []
+    for i, moment in enumerate(moments):
+        log += [f"{i} {i} {i + 1}", *map(numbers, moment.world_from_cam)]
+    put(folder / "scene/trajectory.log", log)
+    columns = OPENCV_K.T.ravel().tolist()
+    camera = {"width": WIDTH, "height": HEIGHT, "intrinsic_matrix": columns}
+    put(folder / "camera_intrinsic.json", [json.dumps(camera)])
+
+
+# Format: its writer, the names of pictures and depth, what has to be given.
+TOOLS = {
+    "colmap": (write_colmap, "images/{:04d}", "depth/{:04d}", {}),
+    "nerf": (write_nerf, "images/{:04d}", "depths/{:04d}", {}),
+    "bop": (write_bop, "rgb/{:06d}", "depth/{:06d}", {"depth_unit_m": 0.001}),
+    "arkitscenes": (write_arkitscenes, "lowres_wide/7_{}", "lowres_depth/7_{}", {"scene": "7"}),
+    "open3d": (write_open3d, "color/{:05d}", "depth/{:05d}", {}),
+}
+
+
+def write(name, folder):
+    tool, rgb, depth, options = TOOLS[name]
+    moments = make_moments(unit_m=0.001)
+    for i, moment in enumerate(moments):
+        number = f"{100 + i / 60:.3f}" if name == "arkitscenes" else i
+        put(folder / f"{rgb.format(number)}.png", moment.rgb)
+        put(folder / f"{depth.format(number)}.png", stored(moment.depth, 0.001))
+    tool(folder, moments)
+    return moments, options
+
+
+@pytest.mark.parametrize("name", TOOLS)
+def test_what_a_tool_wrote_is_read(name, tmp_path):
+    moments, options = write(name, tmp_path)
+    recording = open_recording(tmp_path, name, **options)
+    assert len(recording) == len(moments)
+    for frame, moment in zip(recording, moments):
+        np.testing.assert_allclose(frame.world_from_cam, moment.world_from_cam, atol=1e-7)
+        np.testing.assert_allclose(frame.K, K)
+        np.testing.assert_array_equal(frame.rgb, moment.rgb)
+        np.testing.assert_array_equal(frame.depth, moment.depth)
+
+
+def test_a_picture_that_colmap_did_not_register_is_left_out(tmp_path):
+    write("colmap", tmp_path)
+    path = tmp_path / "sparse/images.txt"
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:4]))
+    recording = open_recording(tmp_path, "colmap", pose_unit_m=2.0)
+    assert [frame.name for frame in recording] == ["0002"]
+    np.testing.assert_allclose(recording[0].world_from_cam[:3, 3], 2 * synthetic.pose(2)[:3, 3])
+
+
+LENS = [-0.2, 0.05, 0.001, -0.002, 0.0]
+ROS = f"""
+image_width: {WIDTH}
+image_height: {HEIGHT}
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: {OPENCV_K.ravel().tolist()}
+distortion_model: plumb_bob
+distortion_coefficients: {{rows: 1, cols: 5, data: {LENS}}}
+"""
+OPENCV = f"""%YAML:1.0
+---
+image_width: {WIDTH}
+image_height: {HEIGHT}
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: {OPENCV_K.ravel().tolist()}
+distortion_coefficients: !!opencv-matrix
+   rows: 5
+   cols: 1
+   dt: d
+   data: {LENS}
+"""
+COLMAP = f"1 OPENCV {WIDTH} {HEIGHT} 31 27 18.5 13 {numbers(LENS[:4])}"
+NERF = {"fl_x": 31, "fl_y": 27, "cx": 18.5, "cy": 13, "w": WIDTH, "h": HEIGHT}
+NERF |= dict(zip(("k1", "k2", "p1", "p2"), LENS))
+
+
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [
+        ("ros.yaml", ROS),
+        ("opencv.yml", OPENCV),
+        ("cameras.txt", COLMAP),
+        ("t.json", json.dumps(NERF)),
+    ],
+)  # fmt: skip
+def test_a_calibration_of_another_tool_is_that_camera_and_lens(file, text, tmp_path):
+    synthetic.write_frames(tmp_path)
+    given = {"first_pixel_centre": 0.5, "distortion": LENS}
+    plain = open_recording(tmp_path, "frames", intrinsics=[31.0, 27.0, 18.5, 13.0], **given)[1]
+    put(tmp_path / file, [text])
+    frame = open_recording(tmp_path, "frames", intrinsics=file)[1]
+    np.testing.assert_allclose(frame.K, K)
+    np.testing.assert_array_equal(frame.depth, plain.depth)
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "says"),
+    [
+        ("cameras.txt", "1 FOV 4 3 1 2 2 0.5", "lens FOV"),
+        ("cameras.txt", "1 PINHOLE 4 3 1 1 2 2\n2 PINHOLE 4 3 1 1 2 2", "2 cameras"),
+        ("a.yaml", "a: [1, }", "a.yaml"),
+        ("transforms.json", '{"camera_angle_x": 0.7}', "width"),
+    ],
+)
+def test_a_calibration_that_cannot_be_read_is_named(file, text, says, tmp_path):
+    synthetic.write_frames(tmp_path)
+    put(tmp_path / file, [text])
+    with pytest.raises(SequenceError, match=says):
+        open_recording(tmp_path, "frames", intrinsics=file)
