@@ -72,16 +72,17 @@ class Sensing:
 
     def observe_all(self, episodes: Sequence[Episode]) -> Arrays:
         """Returns the current observations of N episodes, [N, ...], as `observe` returns each."""
-        names = _DRAWN.intersection(self.names)
-        observation = self._draw(episodes, names) if names else {}
+        if not self.names:
+            return {}
+        names, views = _DRAWN.intersection(self.names), self.views(episodes)
+        observation = self._draw(episodes, views, names) if names else {}
         if not {"prev_from_curr", "instance_motion"}.isdisjoint(self.names):
             now = self._camera_poses([episode.now for episode in episodes])
             before = self._camera_poses([episode.before for episode in episodes])
             if "instance_motion" in self.names:
                 parts_before = world_from_parts(np.stack([e.poses_before for e in episodes]))
-                parts = world_from_parts(np.stack([e.poses for e in episodes]))
                 # Composed in float64 and rounded once. Row 0 is copied, so that it is contiguous.
-                rows = instance_motion(before, now, parts_before, parts).astype(np.float32)
+                rows = instance_motion(before, now, parts_before, views[1]).astype(np.float32)
                 observation |= {"instance_motion": rows, "prev_from_curr": rows[:, 0].copy()}
             else:
                 observation["prev_from_curr"] = relative_motion(before, now).astype(np.float32)
@@ -92,7 +93,8 @@ class Sensing:
 
     def rgb(self, episode: Episode) -> NDArray[np.uint8]:
         """Returns the colour picture [H, W, 3] of an episode's current step."""
-        return self._draw([episode], {"rgb"})["rgb"][0].transpose(1, 2, 0)
+        drawn = self._draw([episode], self.views([episode]), {"rgb"})
+        return drawn["rgb"][0].transpose(1, 2, 0)
 
     def look(self, episode: Episode) -> Picture:
         """Returns PyBullet's picture from an episode's camera, of bodies as last placed."""
@@ -114,12 +116,14 @@ class Sensing:
         }
         return spaces.Dict({name: every[name] for name in self.names})
 
-    def _draw(self, episodes: Sequence[Episode], names: Set[str]) -> Arrays:
+    def _draw(
+        self, episodes: Sequence[Episode], views: tuple[Array, ...], names: Set[str]
+    ) -> Arrays:
         """Returns at least the named maps and colours of N episodes, [N, ...]."""
         if self.renderer == "pybullet":
             pictured = [self._pictured(episode) for episode in episodes]
             return {name: np.stack([maps[name] for maps in pictured]) for name in pictured[0]}
-        views, arrays = self.views(episodes), {}
+        arrays = {}
         colours_too = "rgb" in names and self._scale == 1
         if colours_too or not names.isdisjoint(_MAPS):
             drawn = self._rasteriser(1)(*views, rgb=colours_too)
