@@ -28,7 +28,7 @@ from torchrl.objectives import DiscreteSACLoss, SoftUpdate
 from flowrep.agent import DiscreteSAC, keep_freed_memory
 from flowrep.agent.algorithm import WARM_UP
 from flowrep.agent.observation import has_bf16
-from flowrep.options import DiscreteSACOptions
+from flowrep.config.algorithms import DiscreteSACOptions
 
 MAPS = ("ego", "obj")
 CHANNELS, ACTIONS = 2, 3

@@ -22,8 +22,8 @@ from torchrl.trainers import ReplayBufferTrainer, TargetNetUpdaterHook, Trainer
 from flowrep.agent import DiscreteSAC, ReplayMemory
 from flowrep.agent.dsac import DiscreteSACMapLoss
 from flowrep.agent.networks import DiscreteActions
+from flowrep.config.algorithms import DiscreteSACOptions
 from flowrep.envs import get_states, make_env, set_states
-from flowrep.options import DiscreteSACOptions
 from flowrep.scenes import load_scene
 
 MAPS = ["ego", "obj"]

@@ -9,7 +9,7 @@ import os
 import sys
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from flowrep.extras import require
 
@@ -19,14 +19,75 @@ require(
 )  # fmt: skip
 
 from hydra.core.hydra_config import HydraConfig
+from pydantic import ConfigDict, Field, model_validator
 
 from flowrep.config.cli import run_command
-from flowrep.config.schema import FactorizeConfig, check_reader_options
-from flowrep.usage import UsageError
+from flowrep.config.options import (
+    Command,
+    Count,
+    CountOrZero,
+    Distinct,
+    Flow,
+    Options,
+    Positive,
+    Text,
+    check_reader_options,
+)
+from flowrep.config.usage import UsageError
 
 if TYPE_CHECKING:
     from flowrep import sequences
     from flowrep.sequences.factorization import FlowSource, MotionSource
+
+
+class Reader(Options):
+    """A reader of recordings, whose options are checked against its signature."""
+
+    model_config = ConfigDict(extra="allow")
+    target: str = Field(alias="_target_", pattern=r"^flowrep\.sequences\.\w+$")
+
+    def options(self) -> dict[str, Any]:
+        """Returns the options by name, without the class."""
+        return dict(self.model_extra or {})
+
+
+class FlowScale(Options):
+    """Flow of full colour, pixels."""
+
+    raw: Positive
+    ego: Positive
+    obj: Positive
+
+
+class FactorizeConfig(Command):
+    """The whole config of `flowrep.factorize`."""
+
+    input: Text | int
+    output: Text
+    format: Reader
+    flow: Flow
+    poses: Literal["recorded", "estimated"] | None
+    check: Literal["error", "warn"]
+    start: CountOrZero
+    stop: CountOrZero | None
+    stride: Count
+    check_consistency: bool
+    moving_px: Positive
+    flow_files: Annotated[list[Literal["flo", "kitti", "npz"]], Distinct]
+    masks: bool
+    pictures_every: CountOrZero
+    video: bool
+    video_fps: Positive
+    rerun: bool
+    scale_px: FlowScale
+    depth_range_m: Positive
+
+    @model_validator(mode="after")
+    def _has_a_pair(self) -> FactorizeConfig:
+        if self.stop is not None and self.stop < self.start + self.stride + 1:
+            least = self.start + self.stride + 1
+            raise ValueError(f"stop={self.stop} leaves no pair of frames; give {least} or more")
+        return self
 
 
 def factorize_recording(config: FactorizeConfig) -> int:

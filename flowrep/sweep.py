@@ -28,14 +28,15 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from flowrep.config import cli
-from flowrep.config.schema import TrainConfig, validated_run
+from flowrep.config.folders import OF_THE_MACHINE, register_resolvers, settings_of
+from flowrep.config.usage import UsageError
+from flowrep.config.yaml_file import read_yaml
 from flowrep.experiment.outcomes import is_finished, success_of
+from flowrep.experiment.schema import TrainConfig, validated_run
 from flowrep.files import open_to_append
 from flowrep.progress import STOP_SIGNALS, StopRequest
-from flowrep.usage import UsageError
-from flowrep.yaml_file import read_yaml
 
-cli.register_resolvers()  # for the paths in conf/run_folder.yaml, which a worker resolves too
+register_resolvers()  # for the paths in conf/run_folder.yaml, which a worker resolves too
 
 LOG = "job.log"
 STOP = ".stop"
@@ -142,7 +143,7 @@ def job(config: DictConfig) -> float:
                 folder, asked, log,
                 lambda: stopped.exists() or (is_worker and os.getppid() != PARENT),
                 typed=list(hydra.overrides.task),
-                preset=str(hydra.runtime.choices.get("preset")),
+                settings=settings_of(hydra.runtime.choices),
             )  # fmt: skip
         except Exception as error:  # the other runs go on
             state = f"{FAILED}: error: {' '.join(str(error).split())}"
@@ -224,7 +225,7 @@ def _check_is_same(folder: Path, config: TrainConfig) -> None:
     if asked["algorithm"].get("precision", "auto") == "auto":  # the run has resolved it
         asked["algorithm"] |= {k: v for k, v in stored["algorithm"].items() if k == "precision"}
     for key, value in asked.items():
-        if key not in (*cli.OF_THE_MACHINE, "resume") and stored.get(key) != value:
+        if key not in (*OF_THE_MACHINE, "resume") and stored.get(key) != value:
             raise UsageError(
                 f"'{folder}' holds a run with {key}={stored.get(key)}, the sweep asks for {value}: "
                 "give the sweep another folder with hydra.sweep.dir=, or move it away"

@@ -21,12 +21,13 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
 from flowrep import sweep
-from flowrep.config.cli import OF_THE_MACHINE, checked, end_with, exit_with, line_for, run_command
-from flowrep.config.schema import TrainConfig, validated
+from flowrep.config.cli import checked, end_with, exit_with, line_for, run_command
+from flowrep.config.folders import OF_THE_MACHINE, settings_of
+from flowrep.config.options import validated
+from flowrep.config.usage import UsageError
 from flowrep.experiment.outcomes import is_finished, success_of
-from flowrep.options import ALGORITHMS
+from flowrep.experiment.schema import TrainConfig
 from flowrep.progress import StopRequest
-from flowrep.usage import UsageError
 
 if TYPE_CHECKING:
     from flowrep.experiment.run import RunFolder
@@ -42,16 +43,12 @@ class EarlyCheck(Callback):
         """Ends the process if the config is wrong."""
         try:
             model = checked(config, TrainConfig)
-            if model.resume is not None:
-                return
-            has_own_classes = {*model.trusted} - {*ALGORITHMS}
-            if has_own_classes or model.device not in ("auto", "cpu"):
+            if model.resume is None:
                 from flowrep.experiment import build
 
-                build.device(model.device)
-                build.check_classes(model)
+                build.check(model)
         except Exception as error:  # Hydra would print a warning and go on
-            end_with(error, TrainConfig)
+            end_with(error)
 
 
 def run(config: TrainConfig) -> float:
@@ -70,7 +67,7 @@ def run(config: TrainConfig) -> float:
     folder = RunFolder(job.runtime.output_dir)
     with folder.held():
         folder.check_is_new()
-        announce(config, str(job.runtime.choices.get("preset")))
+        announce(config, settings_of(job.runtime.choices))
         return finish(config, folder, typed)
 
 
@@ -88,10 +85,10 @@ def run_of_sweep() -> None:
                 config = stored.model_copy(update=machine | {"resume": str(folder.path)})
             else:
                 folder.check_is_new()
-                announce(config, asked["preset"])
+                announce(config, asked["settings"])
             finish(config, folder, asked["typed"])
     except Exception as error:
-        end_with(error, TrainConfig)
+        end_with(error)
 
 
 def resumed(config: TrainConfig, folder: RunFolder, typed: list[str]) -> TrainConfig:
@@ -122,7 +119,7 @@ def resumed(config: TrainConfig, folder: RunFolder, typed: list[str]) -> TrainCo
     return stored.model_copy(update=changes | {"resume": str(folder.path)})
 
 
-def announce(config: TrainConfig, preset: str) -> None:
+def announce(config: TrainConfig, settings: str) -> None:
     """Prints what is trained on which device, and on a CPU how long the paper's settings take."""
     import torch
 
@@ -134,9 +131,14 @@ def announce(config: TrainConfig, preset: str) -> None:
     where = torch.cuda.get_device_name(device) if device.type == "cuda" else cpu_name()
     cores = f", {available_cores()} cores" if device.type == "cpu" else ""
     maps, algorithm = ",".join(config.representations), config.algorithm.target.rpartition(".")[2]
-    print(f"{algorithm} on [{maps}] in {config.scene.name}, preset={preset}")
+    print(f"{algorithm} on [{maps}] in {config.scene.name}, {settings}")
     print(f"device: {device.type} ({where}{cores})")
-    if preset == "paper" and device.type == "cpu" and config.total_frames >= 1_000_000:
+    asked = config.evaluation
+    print(
+        f"evaluation.episodes={asked.episodes} every {asked.every_frames:,} frames; at the end "
+        f"evaluation.final_episodes={asked.final_episodes} for each speed, frame rate and policy"
+    )
+    if settings == "preset=paper" and device.type == "cpu" and config.total_frames >= 1_000_000:
         print(
             f"{config.total_frames:,} frames with the paper's settings take two to four days; "
             "preset=laptop takes minutes"
@@ -150,8 +152,10 @@ def finish(config: TrainConfig, folder: RunFolder, typed: Iterable[str] = ()) ->
     """
     from flowrep.agent import CheckpointError, DivergenceError
     from flowrep.envs import WorkerError
+    from flowrep.experiment import build
     from flowrep.experiment.runner import Runner
 
+    build.check(config)
     how_to_go_on = line_for("train", resume=str(folder.path))
     with StopRequest() as stop, closing(Runner(config, folder)) as runner:
         if config.resume is None:

@@ -19,11 +19,12 @@ require("viewing", "train", "hydra", "pydantic", "matplotlib", "imageio_ffmpeg",
 
 from hydra.core.hydra_config import HydraConfig
 
-from flowrep.config.cli import folder_name, run_command
-from flowrep.config.schema import ViewConfig
+from flowrep.config.cli import run_command
+from flowrep.config.folders import folder_name
+from flowrep.config.usage import UsageError
+from flowrep.experiment.schema import ViewConfig
 from flowrep.files import replace_files, write_rows
 from flowrep.progress import progress_bar
-from flowrep.usage import UsageError
 from flowrep.viz import contact_sheet, write_png, write_video
 
 if TYPE_CHECKING:

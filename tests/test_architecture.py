@@ -16,28 +16,24 @@ FLOWREP_IMPORTS_ALLOWED = {
     "geometry": {"geometry", "extras"},
     "transforms": {"transforms", "geometry", "extras"},
     "diagnosis": {"diagnosis", "geometry"},
-    "agent": {"agent", "extras", "files", "options"},
+    "agent": {"agent", "extras", "files", "config"},
     "files": set(),
-    "scenes": {"scenes", "yaml_file", "usage", "extras", "choices"},
-    "simulator": {"simulator", "scenes", "extras", "choices"},
+    "scenes": {"scenes", "config", "extras"},
+    "simulator": {"simulator", "scenes", "extras", "config"},
     "envs": {"envs", "simulator", "scenes", "transforms", "geometry", "extras"}
-    | {"progress", "choices"},
+    | {"progress", "config"},
     "pybullet": {"simulator", "extras"},
     "baselines": {"baselines", "envs", "scenes"},
     "experiment": {"experiment", "baselines", "envs", "simulator", "scenes", "agent"}
     | {"transforms", "geometry", "progress", "config", "extras", "viz"}
-    | {"files", "options", "yaml_file", "usage"},
+    | {"files"},
     "progress": set(),
-    "usage": set(),
     "viz": {"viz", "scenes", "geometry", "files"},
-    "sequences": {"sequences", "config", "progress", "usage", "files", "extras"}
+    "sequences": {"sequences", "config", "progress", "files", "extras"}
     | {"transforms", "geometry", "viz", "diagnosis"},
-    "config": {"config", "choices", "options", "scenes", "yaml_file", "usage"},
-    "choices": set(),
-    "options": set(),
-    "yaml_file": {"usage"},
+    "config": {"config"},
     "report": {"report", "viz", "config", "experiment", "agent", "envs", "scenes"}
-    | {"extras", "files", "choices", "usage"},
+    | {"extras", "files"},
 }
 THIRD_PARTY_ONLY_IN = {
     "pybullet": {"simulator/bullet.py", "pybullet.py"},

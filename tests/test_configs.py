@@ -1,18 +1,12 @@
 """Every file of conf/ composes, and everything in it is used."""
 
-import copy
 import inspect
-import math
-from typing import get_args
 from unittest.mock import Mock
 
 import pytest
 import torch
 
 from flowrep.config import CONF_DIR, config_groups, group_choices
-from flowrep.config.schema import TrainConfig, validated
-from flowrep.options import NoiseOptions, RepresentationOptions
-from flowrep.usage import UsageError
 from tests.config.composing import composed, plain
 
 pytest.importorskip("pybullet", reason="composed configs are built into environments")
@@ -132,58 +126,3 @@ def test_a_representation_spells_out_its_options_with_the_transforms_defaults(na
 
     given = plain("train", f"representations=[{name}]")["representations"][name]
     assert given == representation_options(name)
-    options = get_args(RepresentationOptions.model_fields[name].annotation)[0]
-    assert given.keys() == options.model_fields.keys()
-
-
-IN_RANGE = {
-    "encoding": ["ids", "onehot"], "range_m": [1e-3, 1e6], "missing": [0, 1], "k": [1, 5],
-    "scale": [-1, 1e-3], "preset": ["ultrafast", "fast", "medium", "fine"], "min_side_px": [1, 320],
-    "picture_scale": [1, 4], "depth_sigma_per_m": [0, 2], "depth_dropout": [0, 1],
-    "drift_m": [0, 2], "drift_rad": [0, 2],
-}  # fmt: skip
-NO_NUMBER = [math.inf, -math.inf, math.nan, "1", None, [1]]  # nor a name
-OUT_OF_RANGE = {
-    "encoding": ["none"], "range_m": [0, -1], "missing": [-0.1, 1.1], "k": [0, -1], "scale": [0],
-    "preset": ["slow"], "min_side_px": [0, -1], "picture_scale": [0, -1],
-    "depth_sigma_per_m": [-0.1], "depth_dropout": [-0.1, 1.1], "drift_m": [-0.1],
-    "drift_rad": [-0.1],
-}  # fmt: skip
-DECLARED = [
-    *((f"representations.{name}", option)
-      for name in group_choices("representations")
-      for option in get_args(RepresentationOptions.model_fields[name].annotation)[0].model_fields),
-    *(("flow", option) for option in ("preset", "min_side_px", "picture_scale")),
-    *(("noise", option) for option in NoiseOptions.model_fields),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("section", "option"), DECLARED)
-def test_the_command_and_the_transform_take_the_same_values(section, option):
-    from flowrep.transforms import representation_stack
-
-    K = [[42.0, 0.0, 42.0], [0.0, 42.0, 42.0], [0.0, 0.0, 1.0]]
-    name = section.partition(".")[2] or "ego"
-    config = plain("train", f"representations=[{name}]", "flow=estimated")
-
-    def command(value):
-        given = copy.deepcopy(config)
-        node = given["representations"][name] if "." in section else given[section]
-        node[option] = value
-        validated(TrainConfig, given)
-
-    def transform(value):
-        options = {option: value}
-        maps = {name: options} if "." in section else ["raw", "ego"]
-        other = {"flow": {"source": "estimated"} | options} if section == "flow" else {}
-        other |= {"noise": options} if section == "noise" else {}
-        representation_stack(maps, intrinsics=K, num_classes=5, **other)
-
-    for value in IN_RANGE[option]:
-        command(value)
-        transform(value)
-    for value in [*OUT_OF_RANGE[option], *NO_NUMBER]:
-        with pytest.raises(UsageError, match=option):
-            command(value)
-        with pytest.raises(ValueError, match=option):
-            transform(value)

@@ -18,13 +18,9 @@ from torchrl.envs import TransformedEnv, check_env_specs
 from docs import docstrings
 from flowrep import transforms
 from flowrep.config.cli import as_typed
-from flowrep.config.schema import (
-    EvaluateConfig,
-    FactorizeConfig,
-    ReportConfig,
-    TrainConfig,
-    ViewConfig,
-)
+from flowrep.experiment.schema import EvaluateConfig, TrainConfig, ViewConfig
+from flowrep.factorize import FactorizeConfig
+from flowrep.report.__main__ import ReportConfig
 from flowrep.transforms import RawFlow
 from flowrep.transforms.hydra_configs import CONFIGS
 from tests.config.composing import plain

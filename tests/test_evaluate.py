@@ -14,7 +14,8 @@ pytest.importorskip("pybullet", reason="agents are evaluated in the simulated st
 
 from examples import export_agent
 from flowrep.agent import CheckpointError
-from flowrep.config.schema import EvaluateConfig, validated
+from flowrep.config.options import validated
+from flowrep.config.usage import UsageError
 from flowrep.envs import WorkerError, workers
 from flowrep.evaluate import candidates_of
 from flowrep.evaluate import run as evaluate
@@ -23,8 +24,8 @@ from flowrep.experiment.evaluation import BaselinePolicy, PairedEvaluation
 from flowrep.experiment.policies import PolicyError
 from flowrep.experiment.run import RunFolder
 from flowrep.experiment.runner import Runner
+from flowrep.experiment.schema import EvaluateConfig
 from flowrep.files import TableError
-from flowrep.usage import UsageError
 from tests.config.composing import composed, plain
 
 pytestmark = pytest.mark.slow

@@ -21,14 +21,14 @@ import cv2
 import imageio.v3 as imageio
 
 from flowrep.config import CONF_DIR, group_choices
-from flowrep.config.schema import FactorizeConfig, validated
-from flowrep.factorize import factorize_recording, main, open_stream
+from flowrep.config.options import validated
+from flowrep.config.usage import UsageError
+from flowrep.factorize import FactorizeConfig, factorize_recording, main, open_stream
 from flowrep.files import read_rows
 from flowrep.sequences import Frame, SequenceError, open_recording, read_flow, recorded_motion
 from flowrep.sequences.declared import declaration
 from flowrep.sequences.job import Job
 from flowrep.sequences.output import Output
-from flowrep.usage import UsageError
 from tests.config.composing import plain
 from tests.sequences import synthetic
 from tests.sequences.synthetic import SEVEN_SCENES, needs_7scenes

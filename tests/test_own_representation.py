@@ -9,13 +9,14 @@ import torch
 
 pytest.importorskip("pybullet", reason="the environments are built with it")
 
-from flowrep.config.schema import EvaluateConfig, ViewConfig, validated
+from flowrep.config.options import validated
+from flowrep.config.usage import UsageError
 from flowrep.experiment import build
 from flowrep.experiment.agents import Agent
 from flowrep.experiment.film import Film
 from flowrep.experiment.run import RunFolder
+from flowrep.experiment.schema import EvaluateConfig, ViewConfig
 from flowrep.train import resumed
-from flowrep.usage import UsageError
 from tests.config.composing import composed, plain
 from tests.running import ENVIRONMENT, ROOT, run_python
 
@@ -124,8 +125,10 @@ def test_a_stored_representation_of_flowreps_names_no_code(config, folder):
     run = RunFolder(folder / "run")
     own = {"depth": {"range_m": 100.0, "missing": 0.0, "_target_": "mine.Edges"}}
     run.write_config(config.plain() | {"representations": own})
-    with pytest.raises(UsageError, match=r"representations\.depth\._target_: there is no such key"):
-        run.config(["mine.Edges"])
+    with pytest.raises(UsageError, match=re.escape("depth._target_=mine.Edges")):
+        run.config()
+    with pytest.raises(ValueError, match="depth"):  # and no other class takes its name
+        build.env(run.config(["mine.Edges"]))
 
 
 @pytest.mark.parametrize("name", ["a b", "x;y", "\x1b[2J"])

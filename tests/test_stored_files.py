@@ -18,14 +18,15 @@ pytest.importorskip("pybullet", reason="the commands build the simulated street"
 
 from flowrep import sweep
 from flowrep.agent import CheckpointError, checkpoint, load_checkpoint, save_checkpoint
-from flowrep.config.schema import EvaluateConfig, ViewConfig, validated
+from flowrep.config.options import validated
+from flowrep.config.usage import UsageError
 from flowrep.evaluate import candidates_of
 from flowrep.experiment import film, policies
 from flowrep.experiment.agents import Agent
 from flowrep.experiment.run import RunFolder, RunFolderError, read_drives
+from flowrep.experiment.schema import EvaluateConfig, ViewConfig
 from flowrep.scenes import SceneError, load_scene
 from flowrep.train import resumed
-from flowrep.usage import UsageError
 from flowrep.view import agent_of
 from tests.config.composing import composed, plain
 from tests.experiment.test_run import episode

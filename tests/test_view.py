@@ -9,11 +9,12 @@ import torch
 
 pytest.importorskip("pybullet", reason="the command needs the simulator")
 
-from flowrep.config.schema import ViewConfig, validated
+from flowrep.config.options import validated
+from flowrep.config.usage import UsageError
 from flowrep.experiment.film import Film
+from flowrep.experiment.schema import ViewConfig
 from flowrep.files import read_rows
 from flowrep.scenes import load_scene
-from flowrep.usage import UsageError
 from flowrep.view import (
     FILES,
     agent_of,

@@ -24,7 +24,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 from flowrep.agent.networks import DiscreteActions, acting_network, stochastic_policy
 from flowrep.agent.observation import MapCodec
 from flowrep.agent.replay import OUTCOME, ReplayMemory
-from flowrep.options import AlgorithmOptions, OffPolicyOptions
+from flowrep.config.algorithms import AlgorithmOptions, OffPolicyOptions
 
 Step = Callable[[TensorDictBase], TensorDictBase]
 WARM_UP = 3  # eager updates before the graph is captured; they create Adam's moments and caches

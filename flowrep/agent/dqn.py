@@ -17,7 +17,7 @@ from torchrl.objectives import DQNLoss, ValueEstimators
 
 from flowrep.agent.algorithm import OffPolicy
 from flowrep.agent.networks import DiscreteActions, MapNetwork, PolicyNetwork
-from flowrep.options import DoubleDQNOptions
+from flowrep.config.algorithms import DoubleDQNOptions
 
 
 class EpsilonGreedyPolicy(TensorDictSequential):

@@ -15,7 +15,7 @@ from flowrep.agent import networks
 from flowrep.agent.algorithm import OffPolicy, td_target, transition_keys
 from flowrep.agent.networks import DiscreteActions, Encoder, Head, MapNetwork
 from flowrep.agent.observation import decode_maps
-from flowrep.options import AlgorithmOptions, DiscreteSACOptions, SoftActorCriticOptions
+from flowrep.config.algorithms import AlgorithmOptions, DiscreteSACOptions, SoftActorCriticOptions
 
 METRICS = {
     "q_loss": "loss_qvalue", "actor_loss": "loss_actor", "alpha_loss": "loss_alpha",

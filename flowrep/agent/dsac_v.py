@@ -15,7 +15,7 @@ from flowrep.agent.algorithm import td_target, transition_keys
 from flowrep.agent.dsac import DiscreteSAC
 from flowrep.agent.networks import DiscreteActions, MapNetwork
 from flowrep.agent.observation import decode_maps
-from flowrep.options import DiscreteSACWithValueOptions
+from flowrep.config.algorithms import DiscreteSACWithValueOptions
 
 METRICS = {
     "q_loss": "loss_qvalue", "value_loss": "loss_value", "actor_loss": "loss_actor",

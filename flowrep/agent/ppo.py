@@ -18,7 +18,7 @@ from flowrep.agent.algorithm import Algorithm
 from flowrep.agent.networks import DiscreteActions, Encoder, Head, MapNetwork, stochastic_policy
 from flowrep.agent.observation import MapCodec, decode_maps, store_maps
 from flowrep.agent.replay import OUTCOME, time_first
-from flowrep.options import PPOOptions
+from flowrep.config.algorithms import PPOOptions
 
 
 class Rollout:

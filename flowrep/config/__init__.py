@@ -1,6 +1,6 @@
 """The commands' configs: their files, their schema (`schema`) and their command lines (`cli`)."""
 
-from flowrep.yaml_file import CONF_DIR
+from flowrep.config.yaml_file import CONF_DIR
 
 __all__ = ["CONF_DIR", "config_groups", "group_choices"]
 

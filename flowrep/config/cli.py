@@ -1,8 +1,7 @@
 """Runs a command from its command line; a mistake ends in `error:` lines and exit code 2.
 
-Hydra composes the config and `flowrep.config.schema` checks it. The errors of both are caught here;
-with `HYDRA_FULL_ERROR=1`, their traceback is printed. The functions that name the folders of runs
-and sweeps, which conf/run_folder.yaml calls, are at the end.
+Hydra composes the config and pydantic checks it. Their messages are printed as they are, each as a
+line that names the key; with `HYDRA_FULL_ERROR=1`, tracebacks are printed.
 """
 
 from __future__ import annotations
@@ -13,10 +12,9 @@ import re
 import shlex
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager
-from hashlib import sha1
 from itertools import product
 from pathlib import Path
 from typing import Any, NoReturn
@@ -30,21 +28,20 @@ from hydra.core.utils import env_override
 from hydra.errors import HydraException, MissingConfigException
 from hydra.initialize import get_gh_backup, restore_gh_from_backup
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from flowrep import __version__
 from flowrep.config import CONF_DIR, config_groups, group_choices
+from flowrep.config.algorithms import ALGORITHMS
+from flowrep.config.folders import register_resolvers
 from flowrep.config.foreign import checked_files
-from flowrep.config.schema import ALGORITHMS, Command, TrainConfig, named_classes, validated
-from flowrep.usage import UsageError, closest_first
+from flowrep.config.options import Command, Model, validated
+from flowrep.config.usage import UsageError, closest_first
 
 EXIT_USAGE = 2
 FOLDERS = ("resume", "run", "input", "output", "hydra.run.dir", "hydra.sweep.dir")
 """Keys whose values are folders, whose names may have any characters."""
-OF_THE_MACHINE = ("device", "num_workers", "threads")
-"""Keys that don't define a run and may change when it is resumed."""
-_UNKNOWN_CHOICE = re.compile(r"In '[^']*': Could not (?:find|load) '([^']+)/([^/']+)'")
 IS_DEBUGGING = bool(os.environ.get("HYDRA_FULL_ERROR"))
 
 
@@ -55,7 +52,7 @@ def run_command(config_name: str, command: Callable[[Any], Any], schema: type[Co
         try:
             return command(checked(config, schema))
         except Exception as error:  # caught here, since Hydra would print another line
-            end_with(error, schema)
+            end_with(error)
 
     run_hydra(config_name, job, schema)
 
@@ -69,22 +66,29 @@ def run_hydra(config_name: str, job: Callable[[DictConfig], Any], schema: type[C
         sys.path.append(os.getcwd())  # for policies and classes in modules there, as with -m
     register_resolvers()
     main = hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name=config_name)
+    typed = sys.argv[1:]
     try:
-        sys.argv[1:] = as_typed(sys.argv[1:], schema)
-        _show_if_asked(sys.argv[1:], config_name)
+        sys.argv[1:] = as_typed(typed, schema)
+        _show_if_asked(typed, config_name)
         # Hydra raises its errors, not prints them.
         with env_override({"HYDRA_FULL_ERROR": "1"}), checked_files():
             main(job)()
     except KeyboardInterrupt:
         sys.exit(130)
+    except OSError as error:
+        place = "the output folder can't be created, give another with hydra.run.dir="
+        end_with(error if isinstance(error, HydraException) else UsageError(f"{error}: {place}"))
     except Exception as error:
-        if isinstance(error, OSError) and not isinstance(error, HydraException):
-            problem = f"can't create the output folder ({error}): give another with hydra.run.dir="
-            error = UsageError(problem)
-        end_with(error, schema)
+        # The job ends with its own errors. These are of a line of which Hydra can't make a config,
+        # for instance since there is a list where it expects a name, so they may be of any class.
+        text = explained(error)
+        is_of_hydra = isinstance(error, HydraException) or not is_a_mistake(error)
+        if is_of_hydra and not any(each in text for each in typed):
+            text = f"{shlex.join(typed)}: {text}"
+        end_with(error if IS_DEBUGGING else UsageError(text))
 
 
-def composed(values: Mapping[str, Any]) -> tuple[TrainConfig, str, list[str]]:
+def composed(schema: type[Model], values: Mapping[str, Any]) -> tuple[Model, str, list[str]]:
     """Returns the config of a training with these values, for use in Python.
 
     Also returns the folder that `flowrep.train` would choose, and the values as overrides.
@@ -98,9 +102,9 @@ def composed(values: Mapping[str, Any]) -> tuple[TrainConfig, str, list[str]]:
             hydra.initialize_config_dir(str(CONF_DIR), version_base="1.3"),
         ):
             config = hydra.compose("train", typed, return_hydra_config=True)
-        return checked(config, TrainConfig), str(config.hydra.run.dir), typed
+        return checked(config, schema), str(config.hydra.run.dir), typed
     except (HydraException, OmegaConfBaseException, ValueError) as error:
-        raise UsageError(explained(error, TrainConfig)) from None
+        raise UsageError(explained(error)) from None
 
 
 @contextmanager
@@ -129,48 +133,17 @@ def _overrides(values: Mapping[str, Any], section: str = "") -> Iterator[str]:
                 raise UsageError(f"{section}{key}: {error}") from None
 
 
-def end_with(error: Exception, schema: type[Command]) -> NoReturn:
-    """Ends the process, with the line of a mistake or the traceback of a bug."""
-    if IS_DEBUGGING or not is_a_mistake(error):
-        traceback.print_exception(error)
-        sys.exit(1)
-    text = explained(error, schema)
-    if choice := _UNKNOWN_CHOICE.match(str(error)):
-        group, name = choice.groups()
-        text += (
-            f". To add a choice, create {group}/{name.removesuffix('.yaml')}.yaml in a folder and "
-            "name that folder with --config-dir"
-        )
-    exit_with(text)
-
-
-def is_a_mistake(error: Exception) -> bool:
-    """Returns whether an error is about something that a user can change."""
-    # A launcher raises BrokenExecutor if its worker was killed, for instance for lack of memory.
-    libraries = HydraException, OmegaConfBaseException, YAMLError, BrokenExecutor
-    is_plugin = str(error).startswith("Unknown plugin class")  # Hydra raises a RuntimeError
-    is_ours = type(error).__module__.startswith("flowrep.") or _is_out_of_memory(error)
-    return isinstance(error, (*libraries, ValueError, ImportError, OSError)) or is_plugin or is_ours
-
-
-def _is_out_of_memory(error: Exception) -> bool:
-    # PyTorch raises one of the first two; numpy and numba raise a MemoryError.
-    is_gpu = type(error).__name__ == "OutOfMemoryError"
-    is_cpu = isinstance(error, RuntimeError) and "can't allocate memory" in str(error)
-    return isinstance(error, MemoryError) or is_gpu or is_cpu
-
-
-def checked(config: DictConfig, schema: type[Command]) -> Any:
+def checked(config: DictConfig, schema: type[Model]) -> Model:
     """Returns a composed config as its model; keys that the user added (`+note=pilot`) pass."""
     plain, job = plain_config(config), config.get("hydra") or HydraConfig.get()
-    model = validated(schema, plain)
+    model: Any = validated(schema, plain)
     _check_no_file_is_hidden(job)
     typed = job.overrides.task
     keys = [text.partition("=")[0].rpartition("@")[2] for text in typed]  # +group@key=choice
     for key in (model.model_extra or {}).keys() - {key.lstrip("+").split(".")[0] for key in keys}:
-        raise UsageError(_unknown_key(key, schema))
+        raise UsageError(f"{key}: there is no such key; do you mean one of its sections'?")
     words = {word for text in typed if "_target_" in text for word in re.split(r"[^\w.]", text)}
-    for key, target in named_classes(model).items():
+    for key, target in model.classes.items():
         if target not in (*ALGORITHMS, *words):
             raise UsageError(
                 f"{key}={target} is code outside of flowrep, which a file can't have run: if you "
@@ -211,6 +184,50 @@ def plain_config(config: DictConfig) -> dict[str, Any]:
     return plain
 
 
+# Mistakes.
+
+
+def end_with(error: Exception) -> NoReturn:
+    """Ends the process, with the line of a mistake or the traceback of a bug."""
+    if IS_DEBUGGING or not is_a_mistake(error):
+        traceback.print_exception(error)
+        sys.exit(1)
+    exit_with(explained(error))
+
+
+def is_a_mistake(error: Exception) -> bool:
+    """Returns whether an error is about something that a user can change."""
+    # A launcher raises BrokenExecutor if its worker was killed, for instance for lack of memory.
+    libraries = HydraException, OmegaConfBaseException, YAMLError, BrokenExecutor
+    is_ours = type(error).__module__.startswith("flowrep.") or _is_out_of_memory(error)
+    return isinstance(error, (*libraries, ValueError, ImportError, OSError)) or is_ours
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    # PyTorch raises one of the first two; numpy and numba raise a MemoryError.
+    is_gpu = type(error).__name__ == "OutOfMemoryError"
+    is_cpu = isinstance(error, RuntimeError) and "can't allocate memory" in str(error)
+    return isinstance(error, MemoryError) or is_gpu or is_cpu
+
+
+def explained(error: Exception) -> str:
+    """Returns an error's line; for a choice that there is not, with those that there are."""
+    if _is_out_of_memory(error):
+        reason = str(error).partition("\n")[0] or "MemoryError"
+        remedy = "use fewer envs, or a smaller camera, network or replay_capacity"
+        return f"out of memory ({reason}): {remedy}"
+    if isinstance(error, MissingConfigException) and "/" in str(error.missing_cfg_file):
+        group, _, name = str(error.missing_cfg_file).removesuffix(".yaml").rpartition("/")
+        there = closest_first(name, error.options or group_choices(group))
+        return (
+            f"unknown {group} '{name}'; there are: {there}. To add it, create {group}/{name}.yaml "
+            "in a folder and name the folder with --config-dir"
+        )
+    if isinstance(error, HydraException | OmegaConfBaseException | YAMLError):
+        return " ".join(str(error).split()).partition(" See https://hydra.cc")[0]
+    return str(error)
+
+
 def exit_with(problem: str | Exception, remedy: str = "") -> NoReturn:
     """Ends the process with the exit code of a usage error, printing each line of the problem."""
     print_error(problem)
@@ -225,80 +242,6 @@ def print_error(problem: str | Exception) -> None:
         print(f"error: {line}", file=sys.stderr)
 
 
-def explained(error: Exception, schema: type[Command]) -> str:
-    """Returns an error's line; for a typo in a key or a choice, it lists those that there are."""
-    text = str(error)
-    if _is_out_of_memory(error):
-        reason = text.partition("\n")[0] or "MemoryError"
-        remedy = "use fewer envs, or a smaller camera, network or replay_capacity"
-        return f"out of memory ({reason}): {remedy}"
-    if isinstance(error, FileExistsError | NotADirectoryError):
-        return f"'{error.filename}' is a file, not a folder; give another with output="
-    choice = _UNKNOWN_CHOICE.match(text)
-    if isinstance(error, MissingConfigException) and choice:
-        group, name = choice.groups()
-        there = closest_first(name, error.options or group_choices(group))
-        return f"unknown {group} '{name}'; there are: {there}"
-    if isinstance(error, MissingMandatoryValue):
-        return _needed(str(error.full_key), schema)
-    if needed := re.match(r"You must specify '([^']+)'", text):
-        there = ", ".join(group_choices(needed[1]))
-        return f"{_needed(needed[1], schema)}; choices of {needed[1]}: {there}"
-    unknown = re.match(r"Could not (?:override|delete from config\.) '([^']+)'", text)
-    if unknown:
-        return _unknown_key(unknown[1], schema)
-    if isinstance(error, HydraException | OmegaConfBaseException | YAMLError):
-        text = " ".join(text.split()).partition(" See https://hydra.cc")[0]
-    return text
-
-
-def _needed(key: str, schema: type[Command]) -> str:
-    """Returns the line for a key without a value, with the example at the top of conf/<command>."""
-    _, example, *_ = (CONF_DIR / f"{_name(schema)}.yaml").read_text("utf-8").splitlines()
-    return f"{key} needs a value, for example: {example.removeprefix('# ')}"
-
-
-def _name(schema: type[Command]) -> str:
-    """Returns the name of a command, which is also that of its file in conf/."""
-    return schema.__name__.removesuffix("Config").lower()
-
-
-def _unknown_key(key: str, schema: type[Command]) -> str:
-    """Returns the line for an unknown key, with the sections that have such a key, or all keys."""
-    if "." in key:
-        return f"unknown key '{key}'; python -m flowrep.{_name(schema)} --cfg job shows all keys"
-    groups = [group for group in config_groups() if group in schema.model_fields]
-    files = [(group, path) for group in groups for path in CONF_DIR.glob(f"{group}/**/*.yaml")]
-    line = re.compile(rf"^{re.escape(key)}:", re.MULTILINE)
-    meant = sorted({f"{g}.{key}" for g, path in files if line.search(path.read_text("utf-8"))})
-    keys = [*schema.model_fields, *(("preset", "debug") if "resume" in schema.model_fields else ())]
-    there = f"there are: {closest_first(key, keys)}"
-    return f"unknown key '{key}'; " + (f"do you mean {' or '.join(meant)}?" if meant else there)
-
-
-def _show_if_asked(arguments: Sequence[str], config_name: str) -> None:
-    """Ends the process after --version or --help, which prints conf/ without Hydra's lines."""
-    if "--version" in arguments:
-        print(f"flowrep {__version__}")
-        sys.exit(0)
-    if not {"--help", "-h"} & {*arguments}:
-        return
-    text = (CONF_DIR / f"{config_name}.yaml").read_text(encoding="utf-8")
-    groups = [name for name in config_groups() if re.search(rf"(?m)^ +- {name}:", text)]
-    text = re.sub(r"(?m)^ +- (_self_|override|optional|run_folder).*\n", "", text)
-    if not groups:
-        text = text.replace("defaults:\n", "")
-    print(text.partition("\nhydra:")[0].rstrip())
-    if groups:
-        print("\nChoices of the groups:")
-    for group in groups:
-        print(f"  {group}: {', '.join(group_choices(group))}")
-    print("\nkey=value sets a key, group=choice chooses, -m runs each of several values.")
-    print("--cfg job shows the resulting config with all keys of its groups.")
-    print("--hydra-help lists Hydra's own flags.")
-    sys.exit(0)
-
-
 # Texts with any characters, for Hydra and the shell.
 
 
@@ -307,24 +250,16 @@ def as_typed(arguments: Sequence[str], schema: type[Command]) -> list[str]:
     folders, others, previous = [], [], ""
     for text in arguments:
         key, _, value = text.partition("=")
-        is_split = value.startswith("[") and "]" not in value  # by the shell, at a space
-        if is_split and not Path(value).exists():
-            raise UsageError(f"'{text}' is not a list: write {key}=[a,b] or '{key}=[a, b]'")
         is_argument = text[:1] not in "-~+" and not previous.startswith("-")
         if is_argument and "run" in schema.model_fields and (text == key or Path(text).exists()):
-            folders.append(text)
+            folders.append(override("run", text).removeprefix("run="))
         else:
             others.append(override(key, value) if _is_folder(key, value) else text)
         previous = text
-    # argparse needs all keys side by side, which those of `seed=0,1 -m scene=s_turn` are not.
-    flags = {"-m", "--multirun"} & {*others}
-    others = [*flags, *(text for text in others if text not in flags)]
-    if not folders:
-        return others
-    if any(text.startswith("run=") for text in others):
-        raise UsageError(f"'{folders[0]}' and run= both name folders: leave out run=")
-    quoted = [override("run", text).removeprefix("run=") for text in folders]
-    return [f"run=[{','.join(quoted)}]" if quoted[1:] else f"run={quoted[0]}", *others]
+    if folders and any(text.startswith("run=") for text in others):
+        raise UsageError(f"{folders[0]} and run= both name folders: leave out run=")
+    run = f"[{','.join(folders)}]" if folders[1:] else "".join(folders)
+    return [f"run={run}", *others] if folders else others
 
 
 def _is_folder(key: str, value: str) -> bool:
@@ -365,63 +300,24 @@ def line_for(command: str, **values: str) -> str:
     return shlex.join([*program, *(override(key, text) for key, text in values.items())])
 
 
-# Names of folders.
-
-
-def register_resolvers() -> None:
-    """Registers the functions that conf/ calls to name folders, such as `${run_name:scene,...}`."""
-    for resolver in (run_name, folder_name, run_of_sweep, unless_resumed):
-        OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
-
-
-def run_name(
-    scene: str, representations: Iterable[str], flow: str, noise: Mapping[str, float], seed: int
-) -> str:
-    """Returns the name of a run's folder."""
-    source = "" if flow == "exact" else f"_{flow}"
-    source += "_noisy" if any(noise.values()) else ""
-    return folder_name(f"{scene}_{'+'.join(representations)}{source}_s{seed}")
-
-
-def unless_resumed(resume: str | None, folder: str) -> str:
-    """Returns a new run's folder; for a resumed run the current one, so that Hydra creates none."""
-    return folder if resume is None else "."
-
-
-def folder_name(text: str) -> str:
-    """Returns a text as the name of a single folder, without path separators, not hidden.
-
-    >>> folder_name("s_turn"), folder_name("../../etc"), folder_name("..")
-    ('s_turn', '_.._etc', '_')
-    """
-    name = "".join(c if c.isprintable() and c not in "/\\" else "_" for c in str(text))
-    # File systems allow 255 bytes.
-    return name.encode()[:200].decode(errors="ignore").lstrip(".") or "_"
-
-
-def run_of_sweep(overrides: Iterable[str]) -> str:
-    """Returns the name of a sweep's run's folder, which needs no quotes in a shell or in Hydra.
-
-    Settings of the machine are left out.
-
-    >>> run_of_sweep(["seed=0", "scene=s_turn", "representations=[ego,obj]", "device=cpu"])
-    's_turn_ego+obj_s0'
-    >>> run_of_sweep(["preset=laptop", "algorithm.tau=0.01", "seed=1"])
-    'laptop_s1_algorithm.tau-0.01'
-    """
-
-    def plain(text: str) -> str:
-        joined = re.sub(r"[\[\]{}()'\"\s]", "", text.lstrip("+")).replace(",", "+")
-        return re.sub(r"[^A-Za-z0-9.+_-]", "_", joined)
-
-    values = dict(sorted(text.partition("=")[::2] for text in overrides))
-    for key in OF_THE_MACHINE:
-        values.pop(key, None)
-    by_value = (
-        "experiment", "preset", "debug", "scene", "representations", "flow", "algorithm", "speed",
-    )  # fmt: skip
-    words = [values.pop(key) for key in by_value if key in values]
-    words += [f"s{values.pop('seed')}"] if "seed" in values else []
-    words += [f"{key}-{value}" if value else key for key, value in values.items()]
-    name = "_".join(map(plain, words)) or "run"
-    return name if len(name) <= 100 else f"{name[:100]}_{sha1(name.encode()).hexdigest()[:8]}"
+def _show_if_asked(arguments: Sequence[str], config_name: str) -> None:
+    """Ends the process after --version or --help, which prints conf/ without Hydra's lines."""
+    if "--version" in arguments:
+        print(f"flowrep {__version__}")
+        sys.exit(0)
+    if not {"--help", "-h"} & {*arguments}:
+        return
+    text = (CONF_DIR / f"{config_name}.yaml").read_text(encoding="utf-8")
+    groups = [name for name in config_groups() if re.search(rf"(?m)^ +- {name}:", text)]
+    text = re.sub(r"(?m)^ +- (_self_|override|optional|run_folder).*\n", "", text)
+    if not groups:
+        text = text.replace("defaults:\n", "")
+    print(text.partition("\nhydra:")[0].rstrip())
+    if groups:
+        print("\nChoices of the groups:")
+    for group in groups:
+        print(f"  {group}: {', '.join(group_choices(group))}")
+    print("\nkey=value sets a key, group=choice chooses, -m runs each of several values.")
+    print("--cfg job shows the resulting config with all keys of its groups.")
+    print("--hydra-help lists Hydra's own flags.")
+    sys.exit(0)

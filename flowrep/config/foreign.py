@@ -27,7 +27,7 @@ from hydra.plugins.config_source import ConfigResult, ConfigSource
 from omegaconf import OmegaConf
 
 from flowrep.config import CONF_DIR
-from flowrep.usage import UsageError
+from flowrep.config.usage import UsageError
 
 _OURS = ("structured:", "pkg://hydra.conf", "pkg://hydra_plugins.", "pkg://flowrep.conf")
 _WHOLE = ("preset", "experiment", "debug", "")  # "" is the folder itself, with commands' configs

@@ -14,7 +14,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
-from flowrep.choices import FRAME_RATES_HZ, SpeedMode
+from flowrep.config.options import FRAME_RATES_HZ, SpeedMode
 from flowrep.envs.sensing import EPISODE_SEEDS, SENSORS, Sensing
 from flowrep.scenes.layout import Layout
 from flowrep.scenes.load import load_scene

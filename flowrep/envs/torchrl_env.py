@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import Compose, GymWrapper, TransformedEnv
 
-from flowrep.choices import SpeedMode
+from flowrep.config.options import SpeedMode
 from flowrep.envs.sensing import SENSORS
 from flowrep.envs.street_env import StreetEnv, checked_frame_rate
 from flowrep.envs.vector_env import StreetVectorEnv

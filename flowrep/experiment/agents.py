@@ -11,14 +11,16 @@ import torch
 
 from flowrep.agent import save_checkpoint, torch_threads
 from flowrep.config.cli import composed
-from flowrep.config.schema import Episodes, TrainConfig, validated
+from flowrep.config.options import validated
+from flowrep.config.usage import UsageError
+from flowrep.experiment import build
 from flowrep.experiment.evaluation import EVALUATION_ENVS, FIRST_SEEDS, Driver, PairedEvaluation
 from flowrep.experiment.outcomes import EpisodeRecord
 from flowrep.experiment.policies import packed, policy_of
 from flowrep.experiment.run import RunFolder
 from flowrep.experiment.runner import Runner
+from flowrep.experiment.schema import Episodes, TrainConfig
 from flowrep.progress import StopRequest
-from flowrep.usage import UsageError
 
 
 class Agent(Driver):
@@ -58,7 +60,8 @@ class Agent(Driver):
         """
         if "resume" in overrides:
             raise UsageError("resume=: continue a run with python -m flowrep.train resume=<folder>")
-        config, default, typed = composed(overrides)
+        config, default, typed = composed(TrainConfig, overrides)
+        build.check(config)
         run = RunFolder(default if folder is None else folder)
         run.check_is_new()
         with (

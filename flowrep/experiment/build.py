@@ -12,12 +12,14 @@ from torchrl.envs import EnvBase, InitTracker, Transform
 
 from flowrep.agent import Algorithm
 from flowrep.agent.observation import resolved_precision
-from flowrep.config.schema import EnvConfig, TrainConfig, validated
+from flowrep.config.algorithms import ALGORITHMS, AlgorithmOptions
+from flowrep.config.options import validated
+from flowrep.config.usage import UsageError
 from flowrep.envs import make_env, make_mirror
 from flowrep.envs.torchrl_env import usable_device
-from flowrep.envs.workers import worker_count
-from flowrep.options import ALGORITHMS, AlgorithmOptions
-from flowrep.usage import UsageError
+from flowrep.envs.workers import available_cores, sheltered, worker_count
+from flowrep.experiment.schema import EnvConfig, TrainConfig
+from flowrep.transforms import representation_stack
 
 ENVS_PER_WORKER = 24  # in an evaluation: fewer aren't worth starting a process
 
@@ -43,7 +45,7 @@ def env(config: EnvConfig, **changes: Any) -> EnvBase:
         "representations": config.representations,
         "flow": dict(config.flow),
         "motion": config.motion,
-        "noise": dict(config.noise),
+        "noise": config.noise,
         "num_envs": num_envs,
         "device": device(config.device),
         "speed": config.speed,
@@ -53,6 +55,18 @@ def env(config: EnvConfig, **changes: Any) -> EnvBase:
     maps = arguments["representations"]
     arguments["representations"] = {name: _described(name, maps[name]) for name in maps}
     return make_env(**arguments).append_transform(InitTracker())
+
+
+def training(config: TrainConfig) -> tuple[TrainConfig, EnvBase, Algorithm]:
+    """Returns a training's config as it runs on this machine, its env and its agent, untrained."""
+    config = with_precision(config)
+    share_cores(config)
+    torch.manual_seed(config.seed)
+    streets = env(config, compiled=config.compiled)
+    streets.set_seed(config.seed * config.num_envs)
+    # TorchRL's storage starts multiprocessing's resource tracker, which a SIGHUP would end.
+    with sheltered():
+        return config, streets, agent(config, streets)
 
 
 def agent(config: TrainConfig, env: EnvBase) -> Algorithm:
@@ -87,11 +101,27 @@ def algorithm(section: AlgorithmOptions) -> tuple[Any, Any]:
     return maker, validated(whole, {"algorithm": section.plain()}).algorithm
 
 
-def check_classes(config: TrainConfig) -> None:
-    """Checks that the classes that a config names exist and accept their options."""
-    algorithm(config.algorithm)
-    for name, options in config.representations.items():
-        _described(name, options)
+def check(config: TrainConfig) -> None:
+    """Checks, before a run has a folder, what needs PyTorch to be checked.
+
+    That is the device and the number of threads, the classes that are named, and all options that
+    the algorithm and the transforms of maps, flow and noise take.
+    """
+    device(config.device)
+    if config.threads > (cores := available_cores()):
+        raise UsageError(f"threads={config.threads} on {cores} cores: give {cores} or fewer")
+    algorithm(config.algorithm)[1].first_update(config.num_envs)
+    try:
+        representation_stack(
+            {name: _described(name, given) for name, given in config.representations.items()},
+            intrinsics=[[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]],  # any camera's
+            num_classes=2,
+            flow=dict(config.flow),
+            motion=config.motion,
+            noise=config.noise,
+        )
+    except ValueError as error:
+        raise UsageError(f"representations, flow or noise: {error}") from error
 
 
 def _described(

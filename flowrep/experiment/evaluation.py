@@ -20,11 +20,11 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from flowrep.baselines import BaselinePolicy
-from flowrep.config.schema import EnvConfig
 from flowrep.envs import Outcome
 from flowrep.envs.street_env import hit_name
 from flowrep.experiment import build
 from flowrep.experiment.outcomes import EpisodeRecord
+from flowrep.experiment.schema import EnvConfig
 from flowrep.progress import StopRequest, progress_bar
 from flowrep.scenes import Scene
 

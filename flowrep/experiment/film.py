@@ -17,10 +17,10 @@ from torch import Tensor
 from torchrl.data import Categorical, TensorSpec
 
 from flowrep.baselines import BaselinePolicy
-from flowrep.config.schema import EnvConfig
 from flowrep.envs import street_envs
 from flowrep.experiment.evaluation import Driver, evaluate
 from flowrep.experiment.outcomes import EpisodeRecord
+from flowrep.experiment.schema import EnvConfig
 from flowrep.scenes.vehicle import YAW_SIGN
 from flowrep.transforms import representation_stack
 from flowrep.transforms.stack import FLOWS, FRAMES_OF, REPRESENTATIONS, representation_options

@@ -10,10 +10,10 @@ from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
+from flowrep.config.usage import UsageError
 from flowrep.experiment.outcomes import OUTCOMES, EpisodeRecord
 from flowrep.extras import require
 from flowrep.files import naming, replace_text
-from flowrep.usage import UsageError
 
 if TYPE_CHECKING:
     from torchrl.record.loggers import TensorboardLogger

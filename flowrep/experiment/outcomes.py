@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from flowrep.config.schema import TrainConfig
+    from flowrep.experiment.schema import TrainConfig
 
 OUTCOMES = ("success", "collision", "out_of_bounds", "timeout")
 """How an episode can end. Repeated here, as `flowrep.envs`, which defines it, needs PyBullet."""

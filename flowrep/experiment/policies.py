@@ -23,13 +23,14 @@ from torchrl.data import Composite, TensorSpec
 from flowrep.agent import CheckpointError, load_checkpoint
 from flowrep.baselines import BASELINES
 from flowrep.config.cli import composed
-from flowrep.config.schema import EnvConfig, Machine, TrainConfig, validated, validated_run
+from flowrep.config.options import validated
+from flowrep.config.usage import UsageError, closest_first
 from flowrep.envs import street_envs
 from flowrep.experiment import build
 from flowrep.experiment.run import RunFolder, check_origin, origin_of
+from flowrep.experiment.schema import EnvConfig, Machine, TrainConfig, validated_run
 from flowrep.scenes import Scene, load_scene
 from flowrep.transforms.stack import REPRESENTATIONS, representation_options
-from flowrep.usage import UsageError, closest_first
 
 PRETRAINED = Path(__file__).parents[1] / "pretrained"
 """Agents that come with flowrep, one for each scene; README.md there is their card."""
@@ -214,11 +215,11 @@ def _env_config(given: Mapping[str, Any]) -> EnvConfig:
     if isinstance(maps, str):
         raise UsageError(f"representations: give a list, ['{maps}']")
     if isinstance(maps, Mapping):
-        defaults, _, _ = composed({})
+        defaults, _, _ = composed(TrainConfig, {})
         options = {name: _whole_options(name) | (maps[name] or {}) for name in maps}
         given = {**given, "representations": options or defaults.representations}
     else:
-        defaults, _, _ = composed({"representations": [*maps]})
+        defaults, _, _ = composed(TrainConfig, {"representations": [*maps]})
         given = {**given, "representations": defaults.representations}
     return validated(
         EnvConfig, {key: getattr(defaults, key) for key in EnvConfig.model_fields} | given

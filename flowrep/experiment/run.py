@@ -25,7 +25,8 @@ from filelock import FileLock, Timeout
 from numpy.typing import NDArray
 
 from flowrep import __version__
-from flowrep.config.schema import TrainConfig, validated_run
+from flowrep.config.usage import UsageError
+from flowrep.config.yaml_file import read_yaml
 from flowrep.experiment.loggers import Loggers
 from flowrep.experiment.outcomes import (
     EVALUATION_COLUMNS,
@@ -33,6 +34,7 @@ from flowrep.experiment.outcomes import (
     EpisodeRecord,
     read_episodes,
 )
+from flowrep.experiment.schema import TrainConfig, validated_run
 from flowrep.files import (
     TableError,
     append_rows,
@@ -45,8 +47,6 @@ from flowrep.files import (
     whole_number,
     write_rows,
 )
-from flowrep.usage import UsageError
-from flowrep.yaml_file import read_yaml
 
 if TYPE_CHECKING:
     import torch

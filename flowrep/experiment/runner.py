@@ -24,9 +24,7 @@ from flowrep.agent import (
     torch_threads,
 )
 from flowrep.agent.observation import compute_dtype, has_bf16
-from flowrep.config.schema import TrainConfig
 from flowrep.envs import WorkerError, begin_step, get_states, has_spare_cores, set_states
-from flowrep.envs.workers import sheltered
 from flowrep.experiment import build
 from flowrep.experiment.evaluation import (
     EVALUATION_ENVS,
@@ -36,6 +34,7 @@ from flowrep.experiment.evaluation import (
 )
 from flowrep.experiment.outcomes import OUTCOMES, print_results
 from flowrep.experiment.run import RunFolder, check_origin, machine_of, origin_of
+from flowrep.experiment.schema import TrainConfig
 from flowrep.progress import StopRequest, Stopwatch, progress_bar
 
 
@@ -66,18 +65,10 @@ class Runner:
         folder: RunFolder,
         on_log: Callable[[dict[str, float]], Any] | None = None,  # gets each row of metrics.csv
     ) -> None:
-        config = build.with_precision(config)
-        self.config, self.folder, self.clock = config, folder, Stopwatch()
-        self.on_log = on_log
+        self.folder, self.clock, self.on_log = folder, Stopwatch(), on_log
         logging.getLogger("torchrl").setLevel(logging.WARNING)  # it logs every storage it creates
         keep_freed_memory()
-        build.share_cores(config)
-        torch.manual_seed(config.seed)
-        self.env = build.env(config, compiled=config.compiled)
-        self.env.set_seed(config.seed * config.num_envs)
-        # TorchRL's storage starts multiprocessing's resource tracker, which a SIGHUP would end.
-        with sheltered():
-            self.agent = build.agent(config, self.env)
+        self.config, self.env, self.agent = build.training(config)
         precision = getattr(config.algorithm, "precision", "fp32")
         machine = machine_of(compute_dtype(precision, self.agent.device))
         self.machine = machine | {"threads": config.threads}

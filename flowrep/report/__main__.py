@@ -6,15 +6,28 @@ Slow imports wait until the config has been checked and the runs have been read.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated, Literal
 
 from flowrep.extras import require
 
 require("a report", "report", "hydra", "pydantic", "matplotlib", "scipy", "jinja2", module=__name__)
 
+from pydantic import Field
+
 from flowrep.config.cli import run_command
-from flowrep.config.schema import ReportConfig
+from flowrep.config.options import Command, CountOrZero, OneOrMore, Text
+from flowrep.config.usage import UsageError
 from flowrep.files import refuse_link, replace_text
-from flowrep.usage import UsageError
+
+
+class ReportConfig(Command):
+    """The whole config of `flowrep.report`."""
+
+    run: Annotated[list[Text], Field(min_length=1), OneOrMore]
+    output: Text | None
+    policy: Literal["greedy", "sampled"]
+    trajectories: CountOrZero
+    videos: CountOrZero
 
 
 def report(config: ReportConfig) -> Path:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrep.choices import SpeedMode
+from flowrep.config.options import SpeedMode
 from flowrep.experiment.outcomes import EVALUATION_COLUMNS, OUTCOMES, EpisodeRecord
 from flowrep.experiment.run import RunFolder, RunFolderError, flattened, origin_of
 from flowrep.files import TableError

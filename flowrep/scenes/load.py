@@ -9,11 +9,11 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
+from flowrep.config.usage import UsageError, closest_first
+from flowrep.config.yaml_file import CONF_DIR, read_yaml
 from flowrep.scenes.checks import check_path, check_references, check_walks
 from flowrep.scenes.layout import Layout
 from flowrep.scenes.scene import Scene, SceneError
-from flowrep.usage import UsageError, closest_first
-from flowrep.yaml_file import CONF_DIR, read_yaml
 
 
 def load_scene(scene: str | Path | Mapping[str, Any] | Scene) -> Scene:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, Strict, StringConstraints
 
-from flowrep.choices import FRAME_RATES_HZ, PRINCIPAL_POINT_SHIFT_PX, SpeedMode
+from flowrep.config.options import FRAME_RATES_HZ, PRINCIPAL_POINT_SHIFT_PX, SpeedMode
 
 Kind = Literal["house", "tree", "fence", "car", "traffic_light", "lamp_post"]
 Range = tuple[float, float]

@@ -17,13 +17,13 @@ from omegaconf import OmegaConf
 
 from flowrep import geometry
 from flowrep.config import CONF_DIR, group_choices
-from flowrep.config.schema import check_reader_options
+from flowrep.config.options import check_reader_options
+from flowrep.config.usage import closest_first
 from flowrep.sequences import calibration, files
 from flowrep.sequences.calibration import as_pose, camera_matrix
 from flowrep.sequences.kitti import Kitti
 from flowrep.sequences.recording import Frame, Pose, Recording, SequenceError
 from flowrep.sequences.video import VIDEOS, StillVideo, VideoPictures
-from flowrep.usage import closest_first
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrep.choices import PRINCIPAL_POINT_SHIFT_PX, Renderer
+from flowrep.config.options import PRINCIPAL_POINT_SHIFT_PX, Renderer
 from flowrep.simulator.motion import rigid_inverse
 
 if TYPE_CHECKING:  # scenes need shapely and pydantic, which `flowrep.pybullet` shouldn't import

@@ -8,8 +8,6 @@ import torch
 import yaml
 from torchrl.data import Categorical
 
-from flowrep.config import CONF_DIR
-
 DOCS = Path(__file__).parents[2] / "docs" / "adding_an_algorithm.md"
 
 
@@ -18,7 +16,7 @@ def block(language):
     return found
 
 
-def test_the_example_learns_and_its_yaml_spells_out_its_options(
+def test_the_example_learns_and_takes_the_options_of_its_yaml(
     tmp_path, observation_spec, random_steps
 ):
     (tmp_path / "sarsa.py").write_text(block("python"), encoding="utf-8")
@@ -26,12 +24,10 @@ def test_the_example_learns_and_its_yaml_spells_out_its_options(
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     options = yaml.safe_load(block("yaml"))
-    assert options.pop("defaults") == ["base/off_policy@_here_", "_self_"]
     algorithm = getattr(module, options.pop("_target_").rpartition(".")[2])
-    shared = yaml.safe_load((CONF_DIR / "algorithm" / "base" / "off_policy.yaml").read_text())
-    assert algorithm.OPTIONS(**shared | options) == algorithm.OPTIONS()
+    assert algorithm.OPTIONS(**options) == algorithm.OPTIONS()
 
-    small = algorithm.OPTIONS(**shared | options | {"batch_size": 8, "hidden_size": 32})
+    small = algorithm.OPTIONS(**options, batch_size=8, hidden_size=32)
     agent = algorithm(observation_spec, Categorical(3), ["flow", "seg"], small, total_frames=500)
     action = agent.policy(random_steps(5).exclude("action"))["action"]
     assert action.shape == (5,)

@@ -4,7 +4,7 @@ from tensordict import TensorDict
 from torchrl.data import Categorical, Composite, Unbounded
 
 from flowrep.agent import PPO
-from flowrep.options import PPOOptions
+from flowrep.config.algorithms import PPOOptions
 from tests.agent.test_replay import step as stored_step
 
 ENVS = 2

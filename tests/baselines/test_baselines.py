@@ -9,7 +9,7 @@ import shapely
 
 from flowrep.baselines import BASELINES, Planner
 from flowrep.baselines.planner import GoalDistance
-from flowrep.choices import BaselineName
+from flowrep.config.options import BaselineName
 
 
 def test_the_commands_know_every_baseline():

@@ -4,13 +4,16 @@ import sys
 
 import pytest
 
-from flowrep.config import cli, schema
+from flowrep.config import cli
+from flowrep.experiment import schema
+from flowrep.factorize import FactorizeConfig
+from flowrep.report.__main__ import ReportConfig
 
 SCHEMAS = {
     "train": schema.TrainConfig,
     "evaluate": schema.EvaluateConfig,
-    "factorize": schema.FactorizeConfig,
-    "report": schema.ReportConfig,
+    "factorize": FactorizeConfig,
+    "report": ReportConfig,
     "view": schema.ViewConfig,
 }
 

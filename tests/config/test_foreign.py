@@ -3,7 +3,8 @@
 import pytest
 
 from flowrep.config import cli
-from flowrep.usage import UsageError
+from flowrep.config.usage import UsageError
+from tests.config.conftest import SCHEMAS
 
 WHOLE = "# @package _global_\n"
 REFUSED = {
@@ -38,7 +39,7 @@ def test_a_file_that_leaves_its_group_is_refused_before_anything_runs(run, tmp_p
         (line,) = said.err.splitlines()
         assert "mine" in line
     with pytest.raises(UsageError, match="mine"):
-        cli.composed({"hydra.searchpath": [f"file://{tmp_path}"], group: name})
+        cli.composed(SCHEMAS["train"], {"hydra.searchpath": [f"file://{tmp_path}"], group: name})
 
 
 @pytest.mark.parametrize(

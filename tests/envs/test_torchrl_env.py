@@ -14,6 +14,7 @@ from torchrl.envs.utils import check_env_specs
 
 from flowrep import envs
 from flowrep.config import CONF_DIR
+from flowrep.config.yaml_file import read_yaml
 from flowrep.envs import (
     Outcome,
     begin_step,
@@ -27,7 +28,6 @@ from flowrep.envs.sensing import SENSORS
 from flowrep.scenes import SceneError, load_scene
 from flowrep.scenes.scene import CATEGORY_ID
 from flowrep.transforms import Depth, FlowFactorize, RawFlow
-from flowrep.yaml_file import read_yaml
 from tests.comparing import differing
 
 NOISE = {"depth_sigma_per_m": 0.01, "depth_dropout": 0.1, "drift_m": 0.05, "drift_rad": 0.01}

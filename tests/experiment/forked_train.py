@@ -25,8 +25,8 @@ import torch.utils.tensorboard  # noqa: F401
 import flowrep.agent.checkpoint as checkpoint
 import flowrep.files as files
 import flowrep.train
-from flowrep.config.schema import validated_run
 from flowrep.experiment.run import RunFolder
+from flowrep.experiment.schema import validated_run
 
 
 def die(*_, **__):

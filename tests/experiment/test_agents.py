@@ -12,11 +12,11 @@ pytest.importorskip("pybullet", reason="agents drive in the simulated street")
 import flowrep
 from flowrep.agent import CheckpointError, save_checkpoint
 from flowrep.config import group_choices
+from flowrep.config.usage import UsageError
 from flowrep.experiment.agents import Agent
 from flowrep.experiment.policies import PRETRAINED, packed, unpacked
 from flowrep.experiment.run import RunFolder
 from flowrep.scenes import load_scene
-from flowrep.usage import UsageError
 from tests.comparing import differing
 from tests.config.composing import composed
 

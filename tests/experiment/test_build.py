@@ -7,10 +7,11 @@ import pytest
 pytest.importorskip("pybullet", reason="a run is built with the simulator")
 
 from flowrep.agent import DoubleDQN, observation
-from flowrep.config.schema import ForeignAlgorithm
+from flowrep.config.algorithms import ALGORITHMS
+from flowrep.config.usage import UsageError
+from flowrep.experiment import build
 from flowrep.experiment.build import algorithm, evaluation_workers, with_precision
-from flowrep.options import ALGORITHMS
-from flowrep.usage import UsageError
+from flowrep.experiment.schema import ForeignAlgorithm
 from tests.config.composing import composed
 
 
@@ -19,7 +20,8 @@ def own_module(tmp_path, monkeypatch):
     """A module `someones` with an algorithm."""
     (tmp_path / "someones.py").write_text(
         "from flowrep.agent import DoubleDQN\n"
-        "from flowrep.options import AlgorithmOptions, Count, DoubleDQNOptions, Positive\n"
+        "from flowrep.config.algorithms import AlgorithmOptions, DoubleDQNOptions\n"
+        "from flowrep.config.options import Count, Positive\n"
         "class Learner(DoubleDQN):\n"
         "    class OPTIONS(AlgorithmOptions):\n"
         "        patience: Count\n"
@@ -103,3 +105,29 @@ def test_an_evaluation_is_stepped_by_a_process_a_core_if_each_has_enough_to_do(
     monkeypatch.setattr("flowrep.envs.workers.available_cores", lambda: cores)
     config = composed("device=cpu").model_copy(update={"num_workers": asked})
     assert evaluation_workers(config, num_envs) == workers
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "representations.ego.scale=nan",
+        "representations.ego.scale=a",
+        "+representations.ego.k=2",
+        "representations.seg2.k=0 representations=[seg2]",
+        "representations.depth.missing=2 representations=[depth]",
+        "noise.depth_dropout=1.5",
+        "noise.drift_m=-1",
+        "+noise.drift=1",
+        "flow.estimator=abc flow=estimated",
+        "flow.estimator=raft_small flow=estimated",  # without weights
+        "flow.weights=raft.pth flow=estimated",  # which dis doesn't have
+        "flow.preset=slow flow=estimated",
+        "+flow.preset=fast",  # of exact flow
+        "threads=1000",
+        "device=cuda:93",
+    ],
+)
+def test_what_a_transform_or_a_machine_refuses_is_named_before_a_run_has_a_folder(line):
+    key = line.split()[0].partition("=")[0].rpartition(".")[2].lstrip("+")
+    with pytest.raises(ValueError, match=key):
+        build.check(composed(*line.split()))

@@ -11,13 +11,13 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from flowrep.agent import CheckpointError, DivergenceError, load_checkpoint, save_checkpoint
 from flowrep.config import group_choices
+from flowrep.config.usage import UsageError
 from flowrep.experiment import build
 from flowrep.experiment.run import RunFolder, RunFolderError
 from flowrep.experiment.runner import Every, Means, RecentEpisodes, Runner, progress_text
 from flowrep.progress import StopRequest
 from flowrep.train import finish as finish_run
 from flowrep.train import resumed
-from flowrep.usage import UsageError
 from tests.comparing import differing
 from tests.config.composing import composed, plain
 

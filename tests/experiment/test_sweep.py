@@ -12,10 +12,10 @@ import yaml
 
 from flowrep import sweep
 from flowrep.config import CONF_DIR, cli, group_choices
-from flowrep.config.schema import TrainConfig
+from flowrep.config.usage import UsageError
 from flowrep.experiment.outcomes import EVALUATION_COLUMNS, is_finished
+from flowrep.experiment.schema import TrainConfig
 from flowrep.files import open_to_append, read_rows, write_rows
-from flowrep.usage import UsageError
 from tests.config.composing import composed, plain
 
 

@@ -15,9 +15,8 @@ pytest.importorskip("jinja2", reason="reports are an extra")
 
 from flowrep.config import CONF_DIR
 from flowrep.config.cli import value_of
-from flowrep.config.schema import ReportConfig
 from flowrep.experiment.run import DRIVES
-from flowrep.report.__main__ import main, report
+from flowrep.report.__main__ import ReportConfig, main, report
 from flowrep.report.figures import draw_bars, encoded
 from flowrep.report.page import plans_and_films_of, tracks_of
 from flowrep.report.runs import Condition, grid_of, read_run, read_runs

@@ -8,7 +8,7 @@ import yaml
 
 pytest.importorskip("scipy", reason="reports are an extra")
 
-from flowrep.choices import BaselineName
+from flowrep.config.options import BaselineName
 from flowrep.experiment.run import RunFolderError
 from flowrep.report.runs import DRAWN_BASELINES, groups_of, read_run, read_runs, without_repeats
 from tests.report.folders import config_of, letters, rows_of, run_in, write_run

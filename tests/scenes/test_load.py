@@ -7,9 +7,9 @@ import pytest
 import yaml
 
 from docs import scene_keys
+from flowrep.config.yaml_file import CONF_DIR
 from flowrep.scenes import SceneError, load_scene
 from flowrep.scenes.load import scene_data
-from flowrep.yaml_file import CONF_DIR
 
 CROSSROADS = Path(__file__).parent / "crossroads.yaml"
 

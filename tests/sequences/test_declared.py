@@ -11,8 +11,8 @@ pytest.importorskip("cv2", reason="recordings need OpenCV")
 
 import cv2
 
+from flowrep.config.usage import UsageError
 from flowrep.sequences import SequenceError, factorize_frames, open_recording
-from flowrep.usage import UsageError
 from tests.sequences import synthetic
 from tests.sequences.synthetic import HEIGHT, WIDTH, K, numbers, put, quaternion_line
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import yaml
 
-from flowrep.usage import UsageError
+from flowrep.config.usage import UsageError
 
-_OURS = Path(__file__).resolve().parent / "conf"
+_OURS = Path(__file__).resolve().parents[1] / "conf"
 # In a checkout it is a link to the one beside the package, for `pkg://flowrep.conf`; git makes none
 # on Windows.
 CONF_DIR = (_OURS if _OURS.is_dir() else _OURS.parents[1] / "conf").resolve()

@@ -2,17 +2,17 @@
 
 import pytest
 
-from flowrep.config.schema import (
+from flowrep.config.options import validated
+from flowrep.config.usage import UsageError
+from flowrep.experiment.schema import (
     EvaluateConfig,
-    FactorizeConfig,
-    ReportConfig,
     TrainConfig,
     ViewConfig,
-    validated,
     validated_run,
 )
+from flowrep.factorize import FactorizeConfig
+from flowrep.report.__main__ import ReportConfig
 from flowrep.scenes import Scene
-from flowrep.usage import UsageError
 from tests.config.composing import composed, plain
 
 
@@ -52,20 +52,14 @@ def refusal(command, model, line):
         "device=meta",
         "num_workers=-1",
         "wandb=true",
-        "representations.ego.scale=nan",
         "representations=[]",
         "representations.ego=null",
         "+representations.rgb=null",
-        "noise.depth_dropout=1.5",
-        "flow.estimator=abc flow=estimated",
-        "flow.estimator=raft_small flow=estimated",  # without weights
-        "flow.weights=raft.pth flow=estimated",  # which dis doesn't have
         "renderer=pybullet flow=estimated",  # whose picture_scale is 4
         # keys
         "~seed",
         "+algorithm.gama=0.9",
         "+algorithm.tau=0.1 algorithm=ppo",
-        "+representations.ego.k=2",
         # what leaves nothing to learn
         "algorithm.learning_starts=4991 total_frames=5000",
         "algorithm.batch_size=31",

@@ -2,8 +2,8 @@
 
 import pytest
 
-from flowrep.usage import UsageError
-from flowrep.yaml_file import read_yaml
+from flowrep.config.usage import UsageError
+from flowrep.config.yaml_file import read_yaml
 
 # Each list holds the one before twice: 2 ** 17 - 1 values and lists in line 16.
 DOUBLED = "a0: &a0 [x, x]\n" + "".join(

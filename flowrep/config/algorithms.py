@@ -1,7 +1,6 @@
-"""Options of algorithms, representations, flow and noise: their types, ranges and meanings.
+"""Options of algorithms: their types, ranges and meanings, with the paper's Table II as defaults.
 
-Each class is a section of the commands' configs in `flowrep.config.schema`; an algorithm takes its
-options as such an object. Nothing here imports PyTorch, so that commands can refuse a config fast.
+Nothing here imports PyTorch, so that commands can refuse a config fast.
 
 >>> DiscreteSACOptions(gamma=0.97).tau
 0.005
@@ -9,40 +8,19 @@ options as such an object. Nothing here imports PyTorch, so that commands can re
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-# Larger whole numbers are not exact as floats.
-Count = Annotated[int, Field(ge=1, le=2**53)]
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
-Share = Annotated[float, Field(ge=0, le=1)]
-PositiveShare = Annotated[float, Field(gt=0, le=1)]
-Text = Annotated[str, Field(min_length=1)]
-
-
-def _not_zero(value: float) -> float:
-    if value == 0:
-        raise ValueError("should be a number other than 0")
-    return value
-
-
-NotZero = Annotated[float, AfterValidator(_not_zero)]
-CLASS = r"^\w+(\.\w+)+$"  # package.module.Class
-
-
-class Options(BaseModel):
-    """Named values: unknown names are refused, types are strict, and values can't be changed."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
-
-    def plain(self) -> dict[str, Any]:
-        """Returns names and values as in a config."""
-        return self.model_dump(by_alias=True)
-
-
-# Algorithms, with the paper's Table II as defaults.
+from flowrep.config.options import (
+    CLASS,
+    Count,
+    NotNegative,
+    Options,
+    Positive,
+    PositiveShare,
+    Share,
+)
 
 
 class AlgorithmOptions(Options):
@@ -88,6 +66,12 @@ class OffPolicyOptions(LearnerOptions):
                 f"algorithm.{key}={starts} is less than num_envs={num_envs}, but there is nothing "
                 "to learn from before the envs' second step; raise learning_starts, or lower "
                 "num_envs"
+            )
+        least = (1 + self.n_steps) * num_envs  # a transition of all envs, and the step after it
+        if self.replay_capacity < least:
+            raise ValueError(
+                f"algorithm.replay_capacity={self.replay_capacity} can't hold a transition of "
+                f"num_envs={num_envs}: give at least {least}, or fewer envs"
             )
         return key, starts + self.frames_per_update
 
@@ -161,95 +145,3 @@ ALGORITHMS: dict[str, type[AlgorithmOptions]] = {
     for options in (DiscreteSACOptions, DiscreteSACWithValueOptions, DoubleDQNOptions, PPOOptions)
 }
 """The options of flowrep's algorithms, by `_target_`."""
-
-
-# Representations, flow and noise. The transforms' constructors hold the defaults and check ranges
-# again, as they work without pydantic; importing them takes 3 s, importing this module 0.1 s.
-# tests/test_configs.py checks that both have the same defaults and ranges.
-
-
-class SegmentationOptions(Options):
-    """Options of `flowrep.transforms.Segmentation`."""
-
-    encoding: Literal["ids", "onehot"]
-
-
-class DepthOptions(Options):
-    """Options of `flowrep.transforms.Depth`."""
-
-    range_m: Positive
-    missing: Share
-
-
-class FlowOptions(Options):
-    """Options of raw, ego and object flow."""
-
-    scale: NotZero
-
-
-class StackedSegmentationOptions(SegmentationOptions):
-    """Options of seg2, the last k frames."""
-
-    k: Count
-
-
-class StackedDepthOptions(DepthOptions):
-    """Options of depth2, the last k frames."""
-
-    k: Count
-
-
-class ForeignTransform(Options):
-    """A user's transform, with the arguments of its constructor."""
-
-    model_config = ConfigDict(extra="allow")
-    target: str = Field(alias="_target_", pattern=CLASS)
-
-
-class RepresentationOptions(Options):
-    """The options of each representation, by name; another name is a `ForeignTransform`."""
-
-    model_config = ConfigDict(extra="allow")
-    __pydantic_extra__: dict[str, ForeignTransform]
-    rgb: Options | None = None
-    seg: SegmentationOptions | None = None
-    depth: DepthOptions | None = None
-    raw: FlowOptions | None = None
-    ego: FlowOptions | None = None
-    obj: FlowOptions | None = None
-    seg2: StackedSegmentationOptions | None = None
-    depth2: StackedDepthOptions | None = None
-
-
-class ExactFlowOptions(Options):
-    """`flow=exact`."""
-
-    source: Literal["exact"] = "exact"
-
-
-class EstimatedFlowOptions(Options):
-    """`flow=estimated`: options of `flowrep.transforms.EstimatedFlow`."""
-
-    source: Literal["estimated"]
-    estimator: Literal["dis", "raft_small", "raft_large"]
-    weights: Text | None
-    preset: Literal["ultrafast", "fast", "medium", "fine"]
-    min_side_px: Count
-    picture_scale: Count = 1
-
-    @model_validator(mode="after")
-    def _has_the_weights_it_needs(self) -> EstimatedFlowOptions:
-        if self.estimator != "dis" and self.weights is None:
-            raise ValueError(f"estimator={self.estimator} needs weights=, a file")
-        if self.estimator == "dis" and self.weights is not None:
-            raise ValueError("weights= is for RAFT; estimator=dis has none")
-        return self
-
-
-class NoiseOptions(Options):
-    """Errors of the depth camera and of odometry: options of `flowrep.transforms.SensorNoise`."""
-
-    depth_sigma_per_m: NotNegative = 0.0
-    depth_dropout: Share = 0.0
-    drift_m: NotNegative = 0.0
-    drift_rad: NotNegative = 0.0
