@@ -18,7 +18,7 @@ from jinja2 import FileSystemLoader
 from matplotlib.figure import Figure
 from scipy import stats
 
-from flowrep.report.figures import draw_bars, encoded, styled, words
+from flowrep.report.figures import draw_bars, draw_curves, encoded, styled, words
 from flowrep.report.page import TEMPLATES
 from flowrep.report.runs import (
     SPEEDS,
@@ -28,6 +28,7 @@ from flowrep.report.runs import (
     SuccessGrid,
     baseline_share,
     cell_of,
+    curve_of,
     departures,
     grid_of,
     in_order,
@@ -63,6 +64,7 @@ from paper.claims import (
 HERE = Path(__file__).parent
 DATA, PAGE = HERE.parent / "outputs" / "reference", HERE / "results.md"
 FIGURE, HELD_OUT_FIGURE = "images/results_claims.svg", "images/results_held_out.svg"
+LENGTH_FIGURE = "images/results_length.svg"
 CLAIMS = HERE / "claims.yaml"
 EARLIER = "earlier_verdicts.csv"  # on rows 1 to 8, of runs that are no longer stored
 DISTILLED = "distillation.csv"  # students of examples/distillation.py
@@ -130,26 +132,6 @@ def claims_table(claims: Sequence[Claim], detectable: Sequence[float] | None = N
     else:
         header += ("effect [95 %], p (Holm)", "P(higher)", "by scene", "detectable")
     return _table(header, rows)
-
-
-def recipes_table(
-    primary: Sequence[Claim],
-    earlier: Mapping[int, Mapping[str, str]],
-    later: Sequence[Claim],
-) -> str:
-    """Returns the verdicts on the primary claims with recipes 1, 2 and 3."""
-    rows = []
-    for claim, after in zip(primary, later):
-        of, contrast = earlier[claim.number], claim.contrasts[0]
-        value, low, high = (float(of[key]) / 100 for key in ("effect", "low", "high"))
-        before = f"{points(Estimate(value, low, high))}, p = {of['p']}", f"**{of['verdict']}**"
-        rows.append((_label(claim, contrast), *before, *_verdict_on(claim), *_verdict_on(after)))
-    header = [x for number in (1, 2, 3) for x in (f"recipe {number}, p (Holm)", "verdict")]
-    return _table(("row", *header), rows)
-
-
-def _verdict_on(claim: Claim) -> tuple[str, str]:
-    return effect_text(claim.contrasts[0]), f"**{_short(claim.verdict)}**"
 
 
 def held_out_table(found: Sequence[HeldOut]) -> str:
@@ -238,6 +220,44 @@ def draw_held_out(cells: Sequence[Cell]) -> Figure:
             SuccessGrid(cell.title, grid.series, tuple(shown), cells_shown, baselines_shown)
         )
     return draw_bars(grids)
+
+
+def length_table(scenes: Mapping[str, Sequence[Run]]) -> str:
+    """Returns the success of agents that were trained for the paper's number of frames."""
+    rows = [
+        (SHORT[scene], _stack(stack), *_successes(of), _each_run(of), _precisions(of))
+        for scene, runs in scenes.items()
+        for stack, of in in_stacks(runs).items()
+    ]
+    return _table(("", "", *SPEEDS, "each run, as trained", "precision"), rows)
+
+
+def length_contrasts(claims: Sequence[Claim], found: Mapping[int, Contrast]) -> str:
+    """Returns the contrasts at the paper's number of frames, paired by seed."""
+    rows = [
+        (
+            _label(claims[row - 1], contrast),
+            f"**{_short(contrast.verdict)}**",
+            effect_text(contrast),
+        )
+        for row, contrast in found.items()
+    ]
+    return _table(("row", "verdict", "effect [95 %], p (Holm, by family)"), rows)
+
+
+def _precisions(runs: Sequence[Run]) -> str:
+    names = sorted({name for run in runs for name in run.machine["precision"].split(" | ")})
+    return " and ".join(names)
+
+
+def draw_length(scenes: Mapping[str, Sequence[Run]]) -> Figure:
+    """Returns success over frames, at the speed of training, a panel for each scene."""
+    return draw_curves(
+        [
+            (scene, {stack: [*map(curve_of, of)] for stack, of in in_stacks(runs).items()})
+            for scene, runs in scenes.items()
+        ]
+    )
 
 
 def students(data: Path = DATA) -> Learned:
@@ -655,6 +675,9 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
     later, long = in_its_scenes("laptop"), at_length(declared, studies)
     answers = answers_of(primary, earlier, later, led, held_out, long)
     figures = {FIGURE: draw_answers(primary, answers), HELD_OUT_FIGURE: draw_held_out(cells)}
+    at_that_length = studies[declared["at_length"]["study"]]
+    if at_that_length:
+        figures[LENGTH_FIGURE] = draw_length(at_that_length)
     in_other_ways = {
         n: sensitivity(each.claim.contrasts[0].asked, cells) for n, each in enumerate(held_out, 1)
     }
@@ -670,7 +693,6 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
             answers=answers_table(primary, answers),
             sensitivity=sensitivity_table(in_other_ways),
             undated=[study.replace("_", " ") for study in undated(declared, studies)],
-            recipes=recipes_table(primary, earlier, later),
             later_scenes=[words(scene) for scene in studies["laptop"]],
             held_out=held_out_table(held_out),
             effects=[_points(each.claim.contrasts[0]) for each in held_out],
@@ -700,6 +722,13 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
             spreads=[spread(of.values()) for of in (by_labels, by_rewards)],
             wide=protocols_table(primary, in_its_scenes("wide_speeds"), "straight_road"),
             figure=FIGURE,
+            length_figure=LENGTH_FIGURE,
+            length=length_table(at_that_length) if at_that_length else "",
+            length_contrasts=length_contrasts([*primary, *secondary], long),
+            length_held_out={
+                cell.title: cell_table(cell)
+                for cell in held_out_cells({"held_out": declared["at_length"]}, studies)
+            },
             scenes={words(scene): scene_table(of, scene in forks) for scene, of in main.items()},
             missed=missed_ways(run for run in every if run.scene in forks),
             ways={s: all_ways_found([*chain(*studies[s].values())]) for s in declared["ways"]},

@@ -65,10 +65,10 @@ class Run:
 
     def __post_init__(self) -> None:
         config, scene = self.config, self.config["scene"]
-        self.scene: str = scene["name"]
+        self.scene = str(scene["name"])
         self.stack = stack_of(config["representations"])
         self.seed = int(config["seed"])
-        self.speed: str = config["speed"]  # of the pedestrians in training
+        self.speed = str(config["speed"])  # of the pedestrians in training
         self.fps = float(scene["frame_rate_hz"])
         self.total_frames = int(config["total_frames"])
         columns = (self.metrics.get("frames", np.zeros(0)), self.episodes["frames"])
