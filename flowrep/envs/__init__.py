@@ -40,7 +40,10 @@ SCENE_BY_ID = {
 
 for _id, _scene in SCENE_BY_ID.items():
     gymnasium.register(
-        _id, entry_point="flowrep.envs.gym_wrappers:make_street", kwargs={"scene": _scene}
+        _id,
+        entry_point="flowrep.envs.gym_wrappers:make_street",
+        vector_entry_point="flowrep.envs.gym_wrappers:make_streets",
+        kwargs={"scene": _scene},
     )
 
 __all__ = [

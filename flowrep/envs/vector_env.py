@@ -27,7 +27,8 @@ _STATUS: dict[str, Any] = {
 class StreetVectorEnv(SyncVectorEnv):
     """`StreetEnv`s that are drawn together; the observation contains the status of their episodes.
 
-    There is no autoreset.
+    Without autoreset, an env is stepped on until it is reset; with `AutoresetMode.NEXT_STEP`, the
+    step after an episode's last one begins the next episode instead.
 
     | key | shape | dtype | meaning |
     | --- | --- | --- | --- |
@@ -46,8 +47,12 @@ class StreetVectorEnv(SyncVectorEnv):
 
     num_workers = 0
 
-    def __init__(self, env_fns: Sequence[Callable[[], gym.Env]]) -> None:
-        super().__init__(env_fns, autoreset_mode=AutoresetMode.DISABLED)
+    def __init__(
+        self,
+        env_fns: Sequence[Callable[[], gym.Env]],
+        autoreset_mode: AutoresetMode = AutoresetMode.DISABLED,
+    ) -> None:
+        super().__init__(env_fns, autoreset_mode=autoreset_mode)
         self._streets: list[Any] = [env.unwrapped for env in self.envs]
         cameras = {street.sensing for street in self._streets}
         if len(cameras) != 1:
@@ -79,6 +84,7 @@ class StreetVectorEnv(SyncVectorEnv):
         episodes = options.pop("episodes", None) or [{}] * self.num_envs
         seeds = range(seed, seed + self.num_envs) if isinstance(seed, int | np.integer) else seed
         due = np.flatnonzero(mask).tolist()
+        self._autoreset_envs[due] = False
         for i in due:
             self._is_idle[i] = episodes[i] is None
             if not self._is_idle[i]:
@@ -93,8 +99,13 @@ class StreetVectorEnv(SyncVectorEnv):
         rewards, ended = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=bool)
         driven = [i for i in range(self.num_envs) if not self._is_idle[i]]
         for i in driven:
-            outcome = self._streets[i].drive(actions[i].item())
-            rewards[i], ended[i] = reward(outcome), outcome != Outcome.RUNNING
+            if self._autoreset_envs[i]:
+                self._streets[i].begin()
+            else:
+                outcome = self._streets[i].drive(actions[i].item())
+                rewards[i], ended[i] = reward(outcome), outcome != Outcome.RUNNING
+        if self.autoreset_mode == AutoresetMode.NEXT_STEP:
+            self._autoreset_envs = ended.copy()
         return self._observe(driven), rewards, ended, np.zeros_like(ended), {}
 
     def _observe(self, rows: list[int]) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from gymnasium.utils.env_checker import check_env
 
 from flowrep.envs import Outcome, RepresentationObservation, make_env
 from flowrep.transforms import REPRESENTATIONS, Depth
+from tests.comparing import differing
 
 ID = "flowrep/StraightRoad-v0"
 ALL = [name for name in REPRESENTATIONS if name != "rgb"]
@@ -81,14 +82,21 @@ def test_a_time_out_may_be_a_truncation_and_info_holds_numbers(truncate):
     assert info == expected | {"is_success": False}
 
 
-def test_vectorised_streets_give_stacked_maps():
-    envs = gymnasium.make_vec(ID, num_envs=2, representations=["ego", "obj"])
-    observation, _ = envs.reset(seed=0)
-    assert observation.shape == (2, 4, 84, 84)
-    observation, _, *_, info = envs.step(np.array([1, 2]))
-    assert observation in envs.observation_space
-    assert info["outcome"].dtype.kind == "i"
-    assert not np.array_equal(observation[0], observation[1])
+@pytest.mark.parametrize("joined", [True, False])
+def test_streets_of_make_vec_are_single_streets_side_by_side(joined):
+    options = {"representations": ["obj", "seg2"], "joined": joined, "truncate_timeouts": True}
+    ours = gymnasium.make_vec(ID, num_envs=3, **options)
+    theirs = gymnasium.make_vec(ID, num_envs=3, vectorization_mode="sync", **options)
+    assert ours.observation_space == theirs.observation_space
+    assert ours.metadata["autoreset_mode"] == theirs.metadata["autoreset_mode"]
+    assert differing(ours.reset(seed=4), theirs.reset(seed=4)) == []
+    count = 0
+    for _ in range(25):  # the first one turns off the road; the step after that begins anew
+        one, other = (envs.step(np.array([1, 0, 0])) for envs in (ours, theirs))
+        assert differing(one, other) == []
+        count += one[2].any()
+    assert count
+    assert one[0] in ours.observation_space
 
 
 class Wall(gymnasium.Env):
