@@ -46,7 +46,7 @@ _BASELINE_LINES: dict[str, Any] = {
     "speed_blind": (0, (6, 2, 1, 2)),
 }
 _COLUMN_IN, _PAGE_IN = 3.5, 7.16  # widths of a paper's column and page (IEEE's two columns)
-_MOST_IN_A_ROW = 4  # panels
+_MOST_PANELS_IN_A_ROW = 4  # panels
 _WIDEST_BAR = 0.3  # as a share of a group
 _CAPS: dict[str, Any] = {"capsize": 1.8, "capthick": 0.9, "clip_on": False}  # of whiskers
 
@@ -154,9 +154,9 @@ def draw_curves(panels: Sequence[tuple[str, Mapping[str, Sequence[Curve]]]]) -> 
         for name, of_runs in curves.items():
             for curve in of_runs:
                 thin: Any = {"color": style[name].colour, "linewidth": 0.6, "alpha": 0.6}
-                axes.plot(*_in_thousands(curve.training), **thin)
+                axes.plot(*_thousands_and_percent(curve.training), **thin)
             mean = mean_curve([curve.evaluated for curve in of_runs])
-            axes.plot(*_in_thousands(mean), linewidth=1.5, **style[name].line)
+            axes.plot(*_thousands_and_percent(mean), linewidth=1.5, **style[name].line)
         axes.set_xlabel("frames (thousands)")
 
     return _panels(panels, draw, _line_handles(style))
@@ -165,7 +165,7 @@ def draw_curves(panels: Sequence[tuple[str, Mapping[str, Sequence[Curve]]]]) -> 
 def _panels(
     panels: Sequence[tuple[str, Any]], draw: Callable[[Axes, Any], None], handles: Sequence[Any]
 ) -> Figure:
-    columns = min(len(panels), _MOST_IN_A_ROW)
+    columns = min(len(panels), _MOST_PANELS_IN_A_ROW)
     rows = -(-len(panels) // columns)
     width = _COLUMN_IN if len(panels) == 1 else _PAGE_IN
     with styled():
@@ -240,7 +240,7 @@ def _rate_lines(axes: Axes, grid: SuccessGrid) -> None:
     axes.set_xlabel("frames per second (Hz)")
 
 
-def _in_thousands(points: Sequence[tuple[int, float]]) -> tuple[list[float], list[float]]:
+def _thousands_and_percent(points: Sequence[tuple[int, float]]) -> tuple[list[float], list[float]]:
     return [frames / 1000 for frames, _ in points], [100 * share for _, share in points]
 
 

@@ -55,6 +55,7 @@ def plans_and_films_of(runs: Sequence[Run], *, trajectories: int, videos: int) -
         videos: the number of films of an agent.
     """
     drives = PlansAndFilms({}, {}, [])
+    # One agent of each: plans and films of all seeds would make a page of hundreds of megabytes.
     shown: dict[Any, Run] = {}
     for number, group in enumerate(groups_of(runs)):
         for run in sorted(group.runs, key=lambda run: run.seed):
@@ -108,6 +109,7 @@ def films_of(run: Run) -> list[Path]:
     """Returns the films in a run's folder, except links to files outside of it."""
     if run.folder is None:
         return []
+    # A link in a stranger's folder could put any file of this machine into a page that is passed on.
     home, films = run.folder.resolve(), sorted(run.folder.glob("videos/*.mp4"))
     return [film for film in films if film.is_file() and film.resolve().is_relative_to(home)]
 

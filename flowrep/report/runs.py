@@ -33,7 +33,7 @@ COMPLEMENTARY_STACKS = (
 STACKS = tuple(dict.fromkeys(FLOW_STACKS + COMPLEMENTARY_STACKS))
 DRAWN_BASELINES = ("never_turn", "random", "planner", "speed_blind")
 _REPRESENTATIONS = ("raw", "ego", "obj", "seg", "seg2", "depth", "depth2", "rgb")
-_OF_EVERY_SCENE = ("camera", "frame_rate_hz")  # keys whose values are the same in all scenes
+_SHARED_SCENE_KEYS = ("camera", "frame_rate_hz")  # keys whose values are the same in all scenes
 _TYPES: dict[Any, type] = {"int": int, "float": float, "str": str}
 # Columns of evaluation.csv that don't follow from the run's config and the outcome.
 EPISODE_COLUMNS = {
@@ -112,6 +112,7 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
     runs: dict[str, Run] = {}  # by path, so that a folder given twice counts once
     warnings: list[str] = []
     for folder in folders:
+        # Hydra and wandb leave copies of a run's config.yaml inside of its folder.
         paths = [config.parent for config in sorted(folder.rglob("config.yaml"))]
         paths = [p for p in paths if {".hydra", "wandb"}.isdisjoint(p.relative_to(folder).parts)]
         if not paths:
@@ -187,15 +188,20 @@ def _settings(config: Mapping[str, Any]) -> dict[str, str]:
     parts = origin_of(config) | {"total_frames": config["total_frames"]}
     del parts["flowrep"], parts["seed"]
     scene = parts.pop("scene")
-    shared = {key: scene.pop(key) for key in _OF_EVERY_SCENE if key in scene}
+    # Two scenes always differ in their layout, which must not keep their runs from one report.
+    shared = {key: scene.pop(key) for key in _SHARED_SCENE_KEYS if key in scene}
     parts["scene"] = shared | {scene["name"]: scene}
-    return {key: str(_plain(value)) for key, value in flattened(parts).items() if value != {}}
+    return {
+        key: str(_without_fractions(value))
+        for key, value in flattened(parts).items()
+        if value != {}
+    }
 
 
-def _plain(value: Any) -> Any:
+def _without_fractions(value: Any) -> Any:
     # 4.0 in a file is 4 on a command line
     if isinstance(value, list):
-        return [_plain(part) for part in value]
+        return [_without_fractions(part) for part in value]
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
@@ -238,7 +244,7 @@ def groups_of(runs: Sequence[Run]) -> list[Group]:
     """Returns groups of runs that differ only in scene, representations and seed, largest first."""
     keys = dict.fromkeys(key for run in runs for key in run.settings)
     # "absent" is a value, too: a later version may have added the key
-    values = [{k: run.settings.get(k, "absent") for k in keys if _can_have(run, k)} for run in runs]
+    values = [{k: run.settings.get(k, "absent") for k in keys if _has_key(run, k)} for run in runs]
     differing = [key for key in keys if len({of[key] for of in values if key in of}) > 1]
     groups: dict[tuple[tuple[str, str], ...], list[Run]] = {}
     for run, of in zip(runs, values):
@@ -247,12 +253,12 @@ def groups_of(runs: Sequence[Run]) -> list[Group]:
     return sorted(every, key=lambda group: -len(group.runs))
 
 
-def _can_have(run: Run, key: str) -> bool:
+def _has_key(run: Run, key: str) -> bool:
     section, _, rest = key.partition(".")
     name = rest.split(".")[0]
     if section == "representations":
         return name in run.config[section]
-    return section != "scene" or name in (*_OF_EVERY_SCENE, run.scene)
+    return section != "scene" or name in (*_SHARED_SCENE_KEYS, run.scene)
 
 
 def success_rate(outcomes: Sequence[NDArray[Any]]) -> float:
@@ -290,6 +296,7 @@ def paired_scores(
     Differences then don't depend on the difficulty of episodes. The second value is the number of
     these episodes; without any, the result is None. Runs that lack a condition are left out.
     """
+    # One run without a condition would leave no shared episode, and so no comparison at all.
     ours = [[run for run in side if run.conditions.issuperset(conditions)] for side in sides]
     if not all(ours):
         return None

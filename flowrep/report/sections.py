@@ -44,14 +44,14 @@ _LONGEST_LABEL = 30  # of a config, in a legend
 _ALL = "ego+obj+seg2+depth2"
 
 # The paper's comparisons: name, title, stacks, and differences (first, second).
-_OF_FLOWS = (("ego+obj", "ego"), ("ego+obj", "raw"), ("ego+obj", "obj"), ("raw", "ego"))
-_OF_ADDED = (
+_FLOW_PAIRS = (("ego+obj", "ego"), ("ego+obj", "raw"), ("ego+obj", "obj"), ("raw", "ego"))
+_ADDED_PAIRS = (
     ("ego+obj+seg2", "seg2"), ("ego+obj+depth2", "depth2"), ("ego+obj+seg2", "ego+obj"),
     ("ego+obj+depth2", "ego+obj"), (_ALL, "ego+obj"), ("ego+obj", "seg2"), ("ego+obj", "depth2"),
 )  # fmt: skip
 _EXPERIMENTS = (
-    ("flow_composition", "Composition of the flow maps", FLOW_STACKS, _OF_FLOWS),
-    ("complementary", "Flow with segmentation and depth", COMPLEMENTARY_STACKS, _OF_ADDED),
+    ("flow_composition", "Composition of the flow maps", FLOW_STACKS, _FLOW_PAIRS),
+    ("complementary", "Flow with segmentation and depth", COMPLEMENTARY_STACKS, _ADDED_PAIRS),
 )
 _TABLE_III = ("ego+obj", "depth2", "seg2", "ego+obj+depth2", "ego+obj+seg2", _ALL)
 
@@ -83,8 +83,9 @@ def assemble(runs: Sequence[Run], warnings: Sequence[str], policy: str = "greedy
         policy: whose evaluations are counted, "greedy" or "sampled".
     """
     groups = groups_of(runs)
-    unused = filter(None, (_unusable(run, policy) for run in runs))
+    unused = filter(None, (_why_unused(run, policy) for run in runs))
     sections = []
+    # Folders are numbered only if there are several groups, so that the usual paths stay short.
     for number, group in enumerate(groups, start=1):
         prefix = f"{number}_" if len(groups) > 1 else ""
         for section in _group_sections(group, policy):
@@ -110,7 +111,7 @@ def write_files(report: Report, folder: Path) -> list[Path]:
     return folders
 
 
-def _unusable(run: Run, policy: str) -> str | None:
+def _why_unused(run: Run, policy: str) -> str | None:
     """Returns why a run is in no table, None if it is in one."""
     unused = "only its learning curve is used"
     if not run.is_trained:
@@ -128,7 +129,7 @@ def _unusable(run: Run, policy: str) -> str | None:
 
 
 def _group_sections(group: Group, policy: str) -> list[ReportSection]:
-    runs = [run for run in group.runs if _unusable(run, policy) is None]
+    runs = [run for run in group.runs if _why_unused(run, policy) is None]
     if not runs:
         return _curves(group.runs)
     by_stack = in_stacks(runs)
@@ -142,19 +143,19 @@ def _group_sections(group: Group, policy: str) -> list[ReportSection]:
         every = list(combinations(reversed(by_stack), 2))
         sections.append(_success_section("success", "Success", by_stack, every, policy))
     sections.append(_failure_section(runs, policy))
-    if len(_rates(runs, policy)) > 1:
+    if len(_frame_rates(runs, policy)) > 1:
         sections.append(_rate_section(runs, policy))
     return [*sections, *_curves(group.runs)]
 
 
 # Runs of a group differ only in scene, stack and seed, so all have the first run's speed and frame
 # rate.
-def _rates(runs: Sequence[Run], policy: str) -> list[float]:
+def _frame_rates(runs: Sequence[Run], policy: str) -> list[float]:
     asked = (policy, runs[0].speed)
     return sorted({c.fps for run in runs for c in run.conditions if c[:2] == asked})
 
 
-def _at_speeds(runs: Sequence[Run], policy: str) -> list[Condition]:
+def _conditions_by_speed(runs: Sequence[Run], policy: str) -> list[Condition]:
     fps = runs[0].fps
     driven = [c.speed for run in runs for c in run.conditions if c[::2] == (policy, fps)]
     return [Condition(policy, speed, fps) for speed in in_order(driven, SPEEDS)]
@@ -169,7 +170,7 @@ def _success_section(
     baselines: Sequence[str] = DRAWN_BASELINES,
 ) -> ReportSection:
     runs = [run for members in series.values() for run in members]
-    conditions, scenes = _at_speeds(runs, policy), scenes_of(runs)
+    conditions, scenes = _conditions_by_speed(runs, policy), scenes_of(runs)
     grids = [grid_of(scene, series, conditions, baselines) for scene in scenes]
     trained = listed(sorted({run.speed for run in runs}))
     caption = (
@@ -201,6 +202,7 @@ def _success_table(name: str, grids: Sequence[SuccessGrid], caption: str) -> Tab
             texts = [MISSING if share is None else f"{100 * share:.0f}" for share in shares]
             rows.append((baseline.replace("_", " "), *texts, ""))
         blocks.append((words(grid.scene), tuple(rows)))
+    # A mean over scenes needs every scene: without the hard ones, a stack would look better.
     if len(grids) > 1:
 
         def over_all(key: tuple[str, Condition]) -> str:
@@ -235,6 +237,7 @@ def _differences_table(
                 scored[pair, condition.speed] = list(filter(None, of_scenes))
         rates = [[both for both, _ in of_scenes] for of_scenes in scored.values()]
         effects = list(map(effect, rates))
+        # One family a block: whoever reads a scene's table sees all of its comparisons at once.
         corrected = holm([each.p_value for each in effects])
         rows = []
         for (pair, speed), each, both, p in zip(scored, effects, rates, corrected):
@@ -259,7 +262,7 @@ def _differences_table(
 
 def _failure_section(runs: Sequence[Run], policy: str) -> ReportSection:
     # The paper's Table III, at low and high speed together.
-    fps, driven = runs[0].fps, {c.speed for c in _at_speeds(runs, policy)}
+    fps, driven = runs[0].fps, {c.speed for c in _conditions_by_speed(runs, policy)}
     speeds = ["low", "high"] if {"low", "high"} <= driven else [runs[0].speed]
     conditions = [Condition(policy, speed, fps) for speed in speeds]
     stacks = in_order([run.stack for run in runs], _TABLE_III)
@@ -296,8 +299,8 @@ def _failure_cells(runs: Sequence[Run], conditions: Sequence[Condition]) -> tupl
 
 def _rate_section(runs: Sequence[Run], policy: str) -> ReportSection:
     speed, trained = runs[0].speed, runs[0].fps
-    ours = [run for run in runs if len(_rates([run], policy)) > 1]
-    conditions = [Condition(policy, speed, rate) for rate in _rates(ours, policy)]
+    ours = [run for run in runs if len(_frame_rates([run], policy)) > 1]
+    conditions = [Condition(policy, speed, rate) for rate in _frame_rates(ours, policy)]
     low, high = conditions[0], conditions[-1]
     series = in_stacks(ours)
     grids = [grid_of(scene, series, conditions) for scene in scenes_of(ours)]
@@ -348,7 +351,7 @@ def _configs_section(groups: Sequence[Group], policy: str) -> ReportSection:
     table = Table("configs", caption, ("key", *configs), (("", tuple(rows)),), columns)
 
     series: dict[tuple[str, str], list[Run]] = {}  # of a stack and a config
-    usable = [[run for run in g.runs if _unusable(run, policy) is None] for g in groups]
+    usable = [[run for run in g.runs if _why_unused(run, policy) is None] for g in groups]
     in_configs = Counter(key for runs in usable for key in {(r.scene, r.stack) for r in runs})
     shared = [key for key, number in in_configs.items() if number > 1]
     for stack in in_order([stack for _, stack in shared], STACKS):

@@ -61,11 +61,11 @@ class Table(NamedTuple):
         writer = csv.writer(text, lineterminator="\n")
         first = 0 if any(heading for heading, _ in self.blocks) else 1
         for heading, rows in (("group", (self.header,)), *self.blocks):
-            writer.writerows(map(_inert, (heading, *row)[first:]) for row in rows)
+            writer.writerows(map(_without_formula, (heading, *row)[first:]) for row in rows)
         return text.getvalue()
 
 
-def _inert(cell: str) -> str:
+def _without_formula(cell: str) -> str:
     # Spreadsheets evaluate a cell that begins like a formula, such as a folder named "=1+1".
     begins = cell.startswith(("=", "+", "-", "@", "\t", "\r"))
     return f"'{cell}" if begins and not _NUMBERS.fullmatch(cell) else cell
