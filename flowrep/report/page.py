@@ -109,7 +109,7 @@ def films_of(run: Run) -> list[Path]:
     """Returns the films in a run's folder, except links to files outside of it."""
     if run.folder is None:
         return []
-    # A link in a stranger's folder could put any file of this machine into a page that is passed on.
+    # A link in a stranger's folder could put any file of this machine into the page.
     home, films = run.folder.resolve(), sorted(run.folder.glob("videos/*.mp4"))
     return [film for film in films if film.is_file() and film.resolve().is_relative_to(home)]
 
