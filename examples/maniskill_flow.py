@@ -114,11 +114,12 @@ def flow_transforms() -> Compose:
     """Returns the transforms that write raw, ego and obj of a `ManiSkillEnv`."""
     named = {"depth": ("sensor", "millimetres"), "cam2world_gl": ("sensor", "opengl_pose")}
     K = ("sensor", "K")
+    camera = {"intrinsics": K, "prev_intrinsics": K}  # it never zooms
     return Compose(
         *transforms.sensors_from("maniskill", keys=named),
         transforms.InstanceMotion(),
-        transforms.RawFlow(K),
-        transforms.FlowFactorize(K),
+        transforms.RawFlow(**camera),
+        transforms.FlowFactorize(**camera),
     )
 
 

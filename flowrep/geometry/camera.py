@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, TypeAlias
+from collections.abc import Sequence
+from typing import Any, Literal, TypeAlias
 
 import torch
 from torch import Tensor
@@ -199,18 +200,39 @@ def check_intrinsics(
         )
     if size is None or not min(size):
         return
-    height, width = size
-    side = max(size)
-    shares = K[..., :2, 2] / K.new_tensor([width, height])
-    wrong = ((focal < MIN_FOCAL * side) | (focal > MAX_FOCAL * side)).any(-1)
-    wrong = (wrong | ((shares - 0.5).abs() > 0.5 - MIN_BORDER).any(-1)) & ~unknown
+    # As floats, because a float16 can't hold 20 times the side of a large picture.
+    wrong = ~_fits(*K.float().flatten(-2).unbind(-1), size=size) & ~unknown
     if bool(wrong.any()):
         where, index = first_wrong(name, wrong)
-        raise ValueError(
-            f"{where} can't belong to a picture {width} px wide and {height} px high: fx and fy "
-            f"should be {MIN_FOCAL * side:g} to {MAX_FOCAL * side:g} px, "
-            f"cx {MIN_BORDER * width:g} to {(1 - MIN_BORDER) * width:g}, "
-            f"cy {MIN_BORDER * height:g} to {(1 - MIN_BORDER) * height:g}; "
-            f"got {K[index].tolist()}. If it is for another picture size, or was divided by the "
-            "size, scale its first two rows"
-        )
+        check_size(where, K[index].tolist(), size)
+
+
+def check_size(name: str, K: Sequence[Sequence[float]], size: tuple[int, int]) -> None:
+    """Checks that the rows of one K, as numbers, fit pictures of `size`; see `check_intrinsics`.
+
+    Compiled code can do it, as it reads no tensor.
+    """
+    height, width = size
+    side = max(size)
+    if side == 0 or _fits(*K[0], *K[1], *K[2], size=size):
+        return
+    raise ValueError(
+        f"{name} can't belong to a picture {width} px wide and {height} px high: fx and fy "
+        f"should be {MIN_FOCAL * side:g} to {MAX_FOCAL * side:g} px, "
+        f"cx {MIN_BORDER * width:g} to {(1 - MIN_BORDER) * width:g}, "
+        f"cy {MIN_BORDER * height:g} to {(1 - MIN_BORDER) * height:g}; "
+        f"got {K}. If it is for another picture size, or was divided by the size, scale its first "
+        "two rows"
+    )
+
+
+def _fits(*K: Any, size: tuple[int, int]) -> Any:
+    """Returns whether pictures can have that size, from K's nine numbers or tensors."""
+    fx, _, cx, _, fy, cy, *_ = K
+    (height, width), side = size, max(size)
+    fits = (abs(cx / width - 0.5) <= 0.5 - MIN_BORDER) & (
+        abs(cy / height - 0.5) <= 0.5 - MIN_BORDER
+    )
+    for focal in (fx, fy):
+        fits = fits & (focal >= MIN_FOCAL * side) & (focal <= MAX_FOCAL * side)
+    return fits

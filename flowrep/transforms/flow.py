@@ -12,12 +12,12 @@ from typing import Any, TypeAlias
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import dispatch
-from tensordict.utils import NestedKey, expand_as_right
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Categorical, Composite, TensorSpec, Unbounded
 
 from flowrep import geometry
-from flowrep.geometry.checks import checked_number, first_wrong
+from flowrep.geometry.checks import checked_number
 from flowrep.transforms import base
 from flowrep.transforms.base import (
     Keys,
@@ -34,8 +34,6 @@ DEPTH_KEY: NestedKey = ("sensor", "depth")
 _RAW_KEYS: Keys = [DEPTH_KEY, ("sensor", "instance"), ("sensor", "instance_motion")]
 EGO_KEYS: list[NestedKey] = [DEPTH_KEY, ("sensor", "prev_from_curr")]
 
-_SAME_CAMERA = 1e-5  # share of fx by which K may differ: 0.01 px for a picture 1,000 px wide
-
 # K itself, or the key under which the env gives it.
 Intrinsics: TypeAlias = Tensor | Sequence[Sequence[float]] | NestedKey
 
@@ -44,15 +42,18 @@ class CameraTransform(MapTransform):
     """A transform that needs the camera's K: a constant, or read under a key of the TensorDict.
 
     A constant K keeps its float type, even if the transform is cast to another. If K is read, the
-    last input keys are that of K, `[*B, 3, 3]`, and, if given, that of the previous frame's K. If
-    the first input is raw flow, it becomes nan where the mask under `mask_key` is False.
+    last input keys are that of K, `[*B, 3, 3]`, and, unless K never changes, that of the previous
+    frame's K. If the first input is raw flow, it becomes nan where the mask under `mask_key` is
+    False.
 
-    Values of K are checked when they change; on a GPU, where the check has to wait for them, in two
-    calls of a hundred. An unknown K (nan, inf or a focal length of 0) makes its frame invalid.
+    A constant K is checked in the constructor, and against the maps' size in specs and calls. A K
+    under a key is checked at resets and at the root of batches; on a GPU, which such a check would
+    wait for, only where all envs are reset. An unknown K (nan, inf or a focal length of 0) makes
+    its frame invalid.
 
     Raises:
-        ValueError: K doesn't fit the maps' size, see `check_intrinsics`; or K changes within an
-            episode and no key gives the previous frame's K.
+        ValueError: K doesn't fit the maps' size, see `check_intrinsics`; or K is read under a key,
+            and `prev_intrinsics` is missing.
     """
 
     K: Tensor | None
@@ -71,108 +72,63 @@ class CameraTransform(MapTransform):
     ) -> None:
         # A key is a string or a tuple of strings; K is a tensor or rows of numbers.
         K, keys = None, []
-        if intrinsics is None and self.needs_camera:
-            raise TypeError("intrinsics is K, [3, 3], or its key in the TensorDict; got None")
-        if intrinsics is not None:
-            if isinstance(intrinsics, str) or all(isinstance(part, str) for part in intrinsics):
-                keys = as_keys([intrinsics])
-            else:
-                K = as_intrinsics(intrinsics)
+        if intrinsics is None:
+            if self.needs_camera:
+                raise TypeError("intrinsics is K, [3, 3], or its key in the TensorDict; got None")
+        elif isinstance(intrinsics, str) or all(isinstance(part, str) for part in intrinsics):
+            keys = as_keys([intrinsics])
+        else:
+            K = as_intrinsics(intrinsics)
         if prev_intrinsics is not None:
             if not keys:
                 raise ValueError(
                     "prev_intrinsics is the key of the previous frame's K; intrinsics has to be "
                     "the key of the current frame's"
                 )
-            keys += as_keys([prev_intrinsics])
+            keys += [key for key in as_keys([prev_intrinsics]) if key not in keys]
+        elif keys and self.reads_previous_frame:
+            raise ValueError(
+                f"a K under a key, {keys[0]!r}, may change from frame to frame, and flow depends "
+                "on both frames' K: give prev_intrinsics=, the key that PreviousIntrinsics writes, "
+                f"or {keys[0]!r} again if K never changes within an episode"
+            )
         reads = [*reads, *[CAMERA] * len(keys)]
         super().__init__(reads, [*as_keys(in_keys), *keys], out_keys, writes)
         self.register_buffer("K", K, persistent=False)
+        self._rows = None if K is None else K.tolist()
         self.camera_keys = keys
-        self._calls = 0
-        self._checked: dict[NestedKey, tuple[tuple[int, int], Tensor]] = {}
 
     def _inputs(self, source: TensorDictBase | Composite) -> list[Any]:
         maps = super()._inputs(source)
-        if self.K is not None or self.camera_keys:
-            self._check_cameras(maps)
+        if self._rows is not None:
+            geometry.camera.check_size("intrinsics", self._rows, _map_size(maps, self.reads))
         return maps
 
-    def _check_cameras(self, maps: Sequence[Tensor | TensorSpec]) -> None:
-        """Raises ValueError if K doesn't fit the maps; skips a K that was checked already."""
-        size = _map_size(maps, self.reads)
-        if self.K is not None and ("K" not in self._checked or self._checked["K"][0] != size):
-            geometry.check_intrinsics("intrinsics", self.K, size)
-            self._checked["K"] = size, self.K
-        for key, K in zip(self.camera_keys, maps[len(maps) - len(self.camera_keys) :]):
-            if not isinstance(K, Tensor) or not self._looks_at(K):
-                continue
-            checked = self._checked.get(key)
-            if checked is None or checked[0] != size or not _is_equal(checked[1], K):
-                geometry.check_intrinsics(f"key {key!r}", K, size, allow_unknown=True)
-                self._checked[key] = size, K.detach().clone()
-
-    def _looks_at(self, K: Tensor) -> bool:
-        """Returns whether to read K's values now, which waits for a GPU."""
-        if torch.compiler.is_compiling() or K.is_meta:
-            return False
-        # 0 is the first reset, 1 the first step.
-        return K.is_cpu or self._calls % base.CALLS_PER_LOOK < 2
-
-    def _check_one_camera(
-        self, before: Tensor | None, now: Tensor | None, done: Callable[[], Tensor | None]
-    ) -> None:
-        """Raises ValueError if K changes from frame to frame where no episode is `done`."""
-        if before is None or now is None or not self._looks_at(now) or torch.equal(before, now):
+    def _check_cameras(self, tensordict: TensorDictBase, *, waits: bool = False) -> None:
+        """Raises ValueError for a K under a key that can't be that of the maps."""
+        lacks = any(tensordict.get(key, None) is None for key in self.in_keys)
+        if not self.camera_keys or lacks or torch.compiler.is_compiling():
             return
-        # By more than rounding. An unknown K (nan) compares False.
-        changes = (now - before).abs().amax((-2, -1)) > _SAME_CAMERA * now[..., 0, 0].abs()
-        if (ended := done()) is not None:
-            changes &= ~expand_as_right(ended, changes)
-        if bool(changes.any()):
-            where, index = first_wrong(f"key {self.camera_keys[0]!r}", changes)
-            raise ValueError(
-                f"{where} changes within an episode, from {before[index].tolist()} to "
-                f"{now[index].tolist()}, and flow depends on both: give the key of the previous "
-                "frame's K, prev_intrinsics=, which the transform PreviousIntrinsics writes"
-            )
+        maps = self._inputs(tensordict)
+        for key, K in zip(self.camera_keys, maps[-len(self.camera_keys) :]):
+            if K.is_cpu or (waits and not K.is_meta):
+                size = _map_size(maps, self.reads)
+                geometry.check_intrinsics(f"key {key!r}", K, size, allow_unknown=True)
 
-    def _count_call(self) -> None:
-        if not torch.compiler.is_compiling():  # each number would be compiled anew
-            self._calls += 1
-
-    @property
-    def _needs_one_camera(self) -> bool:
-        return self.reads_previous_frame and len(self.camera_keys) == 1
-
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        self._count_call()
-        if self._needs_one_camera:
-            key = self.camera_keys[0]
-            before, now = (td.get(key, None) for td in (tensordict, next_tensordict))
-            # A later transform may have dropped it; the K of the last call is known on a CPU, where
-            # each call looks at it. Compiled resets look at frames that aren't kept, too.
-            if before is None and now is not None and now.is_cpu and not self.compiled:
-                _, last = self._checked.get(key, (None, None))
-                before = last if last is not None and last.shape == now.shape else None
-            # Where an episode is done, an env with autoreset returns the next one's first frame.
-            self._check_one_camera(before, now, lambda: _ended(next_tensordict, "done"))
-        return super()._step(tensordict, next_tensordict)
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        begins = tensordict.get("_reset", None)
+        if begins is None:
+            self._check_cameras(tensordict_reset, waits=True)
+        elif self.camera_keys and begins.device.type == "cpu":
+            self._check_cameras(tensordict_reset[flags_of_batch(begins, tensordict_reset)])
+        return super()._reset(tensordict, tensordict_reset)
 
     @dispatch(source="in_keys", dest="out_keys", auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the outputs for a batch of any shape, at its root and under `"next"`."""
-        self._count_call()
-        if self._needs_one_camera:
-            # Two frames in a row: the root and "next", or neighbours along the time dimension.
-            key, frames = self.camera_keys[0], tensordict
-            now = tensordict.get(("next", key), None)
-            if now is None and "time" in tensordict.names:
-                before_time = (slice(None),) * tensordict.names.index("time")
-                frames = tensordict[(*before_time, slice(None, -1))]
-                now = tensordict[(*before_time, slice(1, None))].get(key, None)
-            before = frames.get(key, None)
-            self._check_one_camera(before, now, lambda: _ended(frames, ("next", "done")))
+        self._check_cameras(tensordict)
         return super().forward(tensordict)
 
     def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
@@ -280,10 +236,8 @@ class RawFlow(FlowTransform):
     Args:
         intrinsics: K `[3, 3]` of the maps, a tensor or nested lists, pixels; or the env's key for
             it, `[*B, 3, 3]`.
-        prev_intrinsics: key of the previous frame's K, for cameras that zoom or focus, see
-            `PreviousIntrinsics`; `intrinsics` has to be a key then. Without it, a K that changes
-            within an episode raises ValueError. (In a replay sample of single frames, such a change
-            is not visible.)
+        prev_intrinsics: key of the previous frame's K, see `PreviousIntrinsics`; needed if
+            `intrinsics` is a key. The same key says that K never changes within an episode.
         outputs: which of `"raw"` and `"valid"` to write.
         scale: factor on the flow, finite and not 0; the frame rate gives pixels per second.
         compiled: whether `compute` runs through `torch.compile`, which is about five times as fast
@@ -297,7 +251,7 @@ class RawFlow(FlowTransform):
 
     Raises:
         ValueError: an option or K is invalid, or `compiled=True` without a C++ compiler. In calls,
-            see `check_intrinsics` and `prev_intrinsics`.
+            see `check_intrinsics`.
         RuntimeError: in calls, for an id without a row of `instance_motion`.
 
     Example:
@@ -441,16 +395,6 @@ class FlowFactorize(FlowTransform):
         return self._chosen(flows, valid, known)
 
 
-def _is_equal(a: Tensor, b: Tensor) -> bool:
-    return a.dtype == b.dtype and a.device == b.device and torch.equal(a, b)
-
-
-def _ended(tensordict: TensorDictBase, key: NestedKey) -> Tensor | None:
-    """Returns where an episode is over, bool `[*B]`, or None if the TensorDict has no such key."""
-    done = tensordict.get(key, None)
-    return None if done is None else flags_of_batch(done, tensordict)
-
-
 def _map_size(maps: Sequence[Tensor | TensorSpec], reads: Sequence[Reads]) -> tuple[int, int]:
     """Returns height and width of the maps."""
     at, like = next((each.shape.index("H"), i) for i, each in enumerate(reads) if "H" in each.shape)
@@ -469,7 +413,8 @@ def masked_flow(flow: Tensor, key: NestedKey, tensordict: TensorDictBase) -> Ten
             f"key {mask_key(key)!r}, the mask of {key!r}, should be bool or whole numbers "
             f"{list(shape)}; got {known.dtype} {list(known.shape)}: convert or rename it"
         )
-    return torch.where(known.bool(), flow, math.nan)
+    # As bytes, because inductor's CPU code can't compile a `where` on `RawFlow`'s view as bool.
+    return torch.where(known.to(torch.bool).view(torch.uint8) != 0, flow, math.nan)
 
 
 def mask_key(flow: NestedKey) -> NestedKey:

@@ -108,8 +108,8 @@ def test_a_simulator_that_knows_poses_alone_gets_the_flow_of_one_that_knows_moti
     own = Compose(
         T.CameraMotion(out_keys="motion"),
         T.InstanceMotion(out_keys="motions"),
-        T.RawFlow(("sensor", "K"), in_keys=keys),
-        T.FlowFactorize(("sensor", "K"), in_keys=["raw", ("sensor", "depth"), "motion"]),
+        T.RawFlow(INTRINSICS, in_keys=keys),
+        T.FlowFactorize(INTRINSICS, in_keys=["raw", ("sensor", "depth"), "motion"]),
     )
     known = Compose(T.RawFlow(INTRINSICS), T.FlowFactorize(INTRINSICS))
     got = TransformedEnv(FakeSensorEnv((3,)), own).rollout(6, break_when_any_done=False)

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch._dynamo.testing import CompileCounter
+from torchrl.envs.transforms import Compose
 
 from flowrep import transforms as T
 from tests.transforms.fake_env import INTRINSICS, NUM_CLASSES, moments
 
-POSE = ("sensor", "world_from_cam")
+KEY, POSE = ("sensor", "K"), ("sensor", "world_from_cam")
 POSES = "world_from_cam", "world_from_body"
+CAMERAS = [{"intrinsics": INTRINSICS}, {"intrinsics": KEY, "prev_intrinsics": KEY}]
 
 
 def camera_step(before: torch.Tensor, now: torch.Tensor) -> tuple[torch.Tensor, ...]:
@@ -29,7 +32,9 @@ NOISE = {"depth_sigma_per_m": 0.1, "depth_dropout": 0.2, "drift_m": 0.1, "drift_
 TRANSFORMS = {
     "onehot": lambda: T.Segmentation(NUM_CLASSES, encoding="onehot"),
     "depth": T.Depth,
-    "K under a key": lambda: T.RawFlow(("sensor", "K"), scale=0.5, outputs=["raw", "valid"]),
+    "K under a key": lambda: T.RawFlow(
+        KEY, prev_intrinsics=KEY, scale=0.5, outputs=["raw", "valid"]
+    ),
     "ego, obj": lambda: T.FlowFactorize(INTRINSICS, scale=10.0),
     "ray length": lambda: T.AdaptDepth(
         "ray_length", intrinsics=INTRINSICS, in_keys=("sensor", "depth"), out_keys="z"
@@ -90,6 +95,51 @@ def test_one_graph_for_all_batches(case):
     compiled(*case(framed(1))[1])  # torch makes a graph of its own for size 1
     assert counter.frame_count <= 2
     torch._dynamo.reset()
+
+
+SENSORS = ["depth", "instance", "instance_motion", "prev_from_curr", "K"]
+STACKS = {
+    "alone": lambda **camera: T.RawFlow(**camera),
+    "in a Compose": lambda **camera: Compose(T.RawFlow(**camera), T.FlowFactorize(**camera)),
+}
+
+
+class Wrapped(torch.nn.Module):
+    """Takes tensors, as a program that is exported has to."""
+
+    def __init__(self, transform):
+        super().__init__()
+        self.transform = transform
+
+    def forward(self, *sensors):
+        td = self.transform(TensorDict({"sensor": dict(zip(SENSORS, sensors))}, [3]))
+        return tuple(td[key] for key in ("raw", "obj") if key in td)
+
+
+@pytest.mark.slow_after_first
+@pytest.mark.parametrize("camera", CAMERAS, ids=["K", "its key"])
+@pytest.mark.parametrize("make", STACKS.values(), ids=list(STACKS))
+@pytest.mark.parametrize("is_fresh", [True, False])
+def test_compiled_exported_and_on_meta_tensors_whether_it_was_called_before(make, camera, is_fresh):
+    given = tuple(moments(3)["sensor", name] for name in SENSORS)
+    want = Wrapped(make(**camera))(*given)
+    used = Wrapped(make(**camera))
+    if not is_fresh:
+        used(*given)
+    torch.compiler.reset()
+    compiled = torch.compile(used, fullgraph=True, backend="eager")
+    for run in (compiled, torch.export.export(used, given).module()):
+        for got, expected in zip(run(*given), want):
+            assert torch.equal(got, expected)
+    assert all(each.is_meta for each in used.to("meta")(*(x.to("meta") for x in given)))
+
+
+@pytest.mark.slow
+def test_inductor_compiles_two_transforms_into_one_graph():
+    torch.compiler.reset()
+    stack = Compose(T.RawFlow(INTRINSICS), T.FlowFactorize(INTRINSICS))
+    compiled, want = torch.compile(stack, fullgraph=True)(moments(3)), stack(moments(3))
+    torch.testing.assert_close(compiled["obj"], want["obj"], atol=1e-5, rtol=1e-5)
 
 
 def on(device, case):

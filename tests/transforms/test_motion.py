@@ -129,7 +129,9 @@ def test_an_estimate_reads_the_picture_the_prior_and_k_where_it_is_told():
     td = RawFlow(WIDE)(wide_frames())
     td["sensor", "rgb"] = torch.full((3, 3, 16, 24), 9, dtype=torch.uint8)
     td["odometry"], td["K"] = td["truth"].clone(), torch.tensor(WIDE).expand(3, 3, 3)
-    estimate = EstimateCameraMotion("K", picture=("sensor", "rgb"), prior="odometry")
+    estimate = EstimateCameraMotion(
+        "K", prev_intrinsics="K", picture=("sensor", "rgb"), prior="odometry"
+    )
     assert estimate.in_keys == ["raw", ("sensor", "depth"), ("sensor", "rgb"), "odometry", "K"]
     td = estimate(td)
     assert not td["sensor", "motion_valid"].any()  # the picture is plain
