@@ -45,7 +45,6 @@ THIRD_PARTY_ONLY_IN = {
         "config/cli.py",
         "config/foreign.py",
         "sweep.py",
-        "transforms/hydra_configs.py",
     },
 }
 # Extras of the transforms: imported when one is made that needs them, never before.
@@ -62,9 +61,6 @@ PACKAGES_LIMITED_TO = {
     "simulator": {"numpy", "pybullet", "shapely"},
     "pybullet": {"numpy", "pybullet", "gymnasium"},
 }
-
-# Nothing of flowrep imports this one: whoever has Hydra does.
-WITH_HYDRA = {"transforms/hydra_configs.py": {"hydra", "omegaconf"}}
 
 PARTS = {path.stem for path in PACKAGE.iterdir()}  # packages, and modules beside them
 
@@ -107,9 +103,7 @@ def test_imports_point_one_way(path):
     private = [name for name in imported if "._" in name and name.split(".")[0] != "torch"]
     assert not private, f"{private}: private modules change without notice"
     if part in PACKAGES_LIMITED_TO:
-        extras = LAZILY.get(place.as_posix(), set()) | WITH_HYDRA.get(place.as_posix(), set())
-        assert outside <= PACKAGES_LIMITED_TO[part] | extras
-    assert "flowrep.transforms.hydra_configs" not in imported
+        assert outside <= PACKAGES_LIMITED_TO[part] | LAZILY.get(place.as_posix(), set())
     for package, places in THIRD_PARTY_ONLY_IN.items():
         assert package not in outside or str(place) in places
 
