@@ -1,5 +1,6 @@
 """docs/adding_a_representation.md: a transform and a YAML file outside of a clone are enough."""
 
+import importlib
 import os
 import re
 import sys
@@ -16,12 +17,13 @@ from flowrep.experiment.agents import Agent
 from flowrep.experiment.film import Film
 from flowrep.experiment.run import RunFolder
 from flowrep.experiment.schema import EvaluateConfig, ViewConfig
+from flowrep.geometry import ego_flow
 from flowrep.train import resumed
 from tests.config.composing import composed, plain
 from tests.running import ENVIRONMENT, ROOT, run_python
 
 PAGE = ROOT / "docs" / "adding_a_representation.md"
-TYPED = "+representations.edges._target_=mine.Edges"
+TYPED = "+representations.contact._target_=mine.TimeToContact"
 
 
 def block(language):
@@ -34,7 +36,7 @@ def folder(tmp_path, monkeypatch):
     """The page's module, on the path, and its folder of configs."""
     (tmp_path / "mine.py").write_text(block("python"), encoding="utf-8")
     (tmp_path / "my_configs" / "representations").mkdir(parents=True)
-    (tmp_path / "my_configs" / "representations" / "edges.yaml").write_text(block("yaml"))
+    (tmp_path / "my_configs" / "representations" / "contact.yaml").write_text(block("yaml"))
     monkeypatch.syspath_prepend(tmp_path)
     yield tmp_path
     sys.modules.pop("mine", None)
@@ -43,7 +45,16 @@ def folder(tmp_path, monkeypatch):
 @pytest.fixture
 def config(folder):
     search = f"hydra.searchpath=[file://{folder / 'my_configs'}]"
-    return composed(search, "representations=[ego,edges]", "debug=smoke", "device=cpu")
+    return composed(search, "representations=[ego,contact]", "debug=smoke", "device=cpu")
+
+
+def test_a_wall_two_steps_ahead_is_in_contact_in_two_steps_wherever_it_is_seen(folder):
+    K = torch.tensor([[40.0, 0, 2.3], [0, 50, 1.2], [0, 0, 1]])
+    ahead = torch.eye(4)
+    ahead[2, 3] = 3.0  # the camera drives 3 m a step at a wall that is 6 m ahead now
+    raw = ego_flow(torch.full((1, 3, 5), 6.0), K, ahead).flow
+    (contact,) = importlib.import_module("mine").TimeToContact(K, steps=1.0).compute(raw)
+    torch.testing.assert_close(contact, torch.full((1, 3, 5), 0.5))
 
 
 def test_an_agent_acts_on_it_and_a_film_shows_it(config):
@@ -51,11 +62,11 @@ def test_an_agent_acts_on_it_and_a_film_shows_it(config):
     agent = build.agent(config, env)
     maps = env.reset()
     assert agent.policy(maps)["action"].shape == (4,)
-    assert [codec.key for codec in agent.codecs] == ["ego", "edges"]
-    assert maps["edges"].amax() == 1.0  # to the sky
+    assert [codec.key for codec in agent.codecs] == ["ego", "contact"]
+    assert "raw" not in maps  # which it reads, and nobody asked for
     env.close()
     film = Film(Agent("never_turn", config))
-    assert "edges" in film.framed
+    assert "contact" in film.framed
     film.close()
 
 
@@ -68,18 +79,19 @@ def test_a_film_leaves_out_a_map_that_is_no_picture_of_the_camera_s_shape(config
 
 
 def test_its_options_reach_it_and_are_checked_by_it(config):
-    def edges(**options):
-        own = {"edges": {"_target_": "mine.Edges", **options}}
+    def contact(**options):
+        own = {"contact": {"_target_": "mine.TimeToContact", **options}}
         env = build.env(config.model_copy(update={"representations": own}), seed=0)
-        maps = env.reset()["edges"]
+        maps = env.rollout(1)["next", "contact"]
         env.close()
         return maps
 
-    assert torch.equal(edges(factor=0.0), torch.zeros(4, 1, 40, 48))
-    with pytest.raises(UsageError, match=r"representations\.edges.*factr"):
-        edges(factr=1.0)
-    with pytest.raises(UsageError, match=r"mine\.Egdes"):
-        build.env(config.model_copy(update={"representations": {"e": {"_target_": "mine.Egdes"}}}))
+    assert torch.equal(contact(steps=0.0), torch.zeros(4, 1, 1, 40, 48))
+    assert 0 < contact(steps=1.0).amax() < contact().amax()
+    with pytest.raises(UsageError, match=r"representations\.contact.*stepps"):
+        contact(stepps=1.0)
+    with pytest.raises(UsageError, match=r"mine\.Contact"):
+        contact(_target_="mine.Contact")
     no_transform = {"e": {"_target_": "flowrep.agent.PPO"}}
     with pytest.raises(UsageError, match="Transform"):
         build.env(config.model_copy(update={"representations": no_transform}))
@@ -95,7 +107,7 @@ def stored_config(run, *typed):
     return resumed(asked, run, [f"resume={run.path}", *typed])
 
 
-@pytest.mark.parametrize("typed", [[], ["+representations.edges._target_=mine.Other"]])
+@pytest.mark.parametrize("typed", [[], ["+representations.contact._target_=mine.Other"]])
 def test_a_stored_run_names_no_code(config, folder, typed):
     run = RunFolder(folder / "run")
     run.write_config(config.plain())
@@ -118,23 +130,23 @@ def test_what_the_user_typed_is_used(config, folder):
     target = TYPED.partition("=")[2]
     assert run.config(target).representations == config.representations  # one without a list
     with pytest.raises(UsageError, match="representations="):
-        command(EvaluateConfig, "evaluate", "run=x", TYPED, "+representations.edges.factor=1.0")
+        command(EvaluateConfig, "evaluate", "run=x", TYPED, "+representations.contact.steps=1.0")
 
 
 def test_a_stored_representation_of_flowreps_names_no_code(config, folder):
     run = RunFolder(folder / "run")
-    own = {"depth": {"range_m": 100.0, "missing": 0.0, "_target_": "mine.Edges"}}
+    own = {"depth": {"range_m": 100.0, "missing": 0.0, "_target_": "mine.TimeToContact"}}
     run.write_config(config.plain() | {"representations": own})
-    with pytest.raises(UsageError, match=re.escape("depth._target_=mine.Edges")):
+    with pytest.raises(UsageError, match=re.escape("depth._target_=mine.TimeToContact")):
         run.config()
-    with pytest.raises(ValueError, match="depth"):  # and no other class takes its name
-        build.env(run.config(["mine.Edges"]))
+    with pytest.raises(UsageError, match="depth"):  # and no other class takes its name
+        build.env(run.config(["mine.TimeToContact"]))
 
 
 @pytest.mark.parametrize("name", ["a b", "x;y", "\x1b[2J"])
 def test_a_name_that_no_map_can_have_is_not_offered_as_an_override(config, folder, name):
     run = RunFolder(folder / "run")
-    own = {name: {"_target_": "mine.Edges"}}
+    own = {name: {"_target_": "mine.TimeToContact"}}
     run.write_config(config.plain() | {"representations": own})
     with pytest.raises(UsageError) as refused:
         run.config()
@@ -149,9 +161,9 @@ def test_from_the_command_line(folder):
         return run_python("-m", f"flowrep.{command}", *arguments, env=env, cwd=folder)
 
     done = run(
-        "train", "--config-dir", "my_configs", "representations=[ego,edges]", "debug=smoke",
+        "train", "--config-dir", "my_configs", "representations=[ego,contact]", "debug=smoke",
         TYPED.lstrip("+"),
-        "device=cpu", "representations.edges.factor=8", "hydra.run.dir=run", "total_frames=64",
+        "device=cpu", "representations.contact.steps=5", "hydra.run.dir=run", "total_frames=64",
         "scene.time_limit_steps=20", "evaluation.speeds=[low]", "evaluation.baselines=[]",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

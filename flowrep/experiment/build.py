@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pkgutil import resolve_name
 from typing import Any
 
@@ -124,18 +125,18 @@ def check(config: TrainConfig) -> None:
         raise UsageError(f"representations, flow or noise: {error}") from error
 
 
-def _described(
-    name: str, options: Mapping[str, Any] | None
-) -> Mapping[str, Any] | Transform | None:
-    """Returns a representation's options, or the user's transform that they describe."""
+def _described(name: str, options: Mapping[str, Any] | None) -> Any:
+    """Returns a representation's options, or the user's class with them, checked."""
     if not options or "_target_" not in options:
         return options
     arguments = dict(options)
     maker = _class(f"representations.{name}", arguments.pop("_target_"), Transform)
-    try:
-        return maker(**arguments, out_keys=name)
+    described = partial(maker, **arguments)
+    try:  # with any camera: `representation_stack` calls it with the scene's
+        representation_stack({name: described}, intrinsics=torch.eye(3), num_classes=1)
     except (TypeError, ValueError) as error:
         raise UsageError(f"representations.{name}: {error}") from error
+    return described
 
 
 def _class(key: str, target: str, base: type) -> Any:

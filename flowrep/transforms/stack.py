@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
@@ -19,7 +19,9 @@ from flowrep.transforms.maps import Depth, Rgb, Segmentation
 from flowrep.transforms.motion import EstimateCameraMotion
 from flowrep.transforms.noise import NOISY_SENSORS, SensorNoise
 
-Representations = Sequence[str] | Mapping[str, Mapping[str, Any] | Transform | None]
+# A user's transform may be given as its class (or a function), which is then called with out_keys.
+Described: TypeAlias = Mapping[str, Any] | Transform | Callable[..., Transform] | None
+Representations: TypeAlias = Sequence[str] | Mapping[str, Described]
 Arguments = dict[str, Any]
 
 _SOURCES = ("exact", "estimated")
@@ -87,7 +89,10 @@ def representation_stack(
     Args:
         representations: names from `REPRESENTATIONS`, which are also the keys in the TensorDict, or
             a mapping from name to options (see `representation_options`). The mapping may also hold
-            transforms of your own, each under the name of the key that it writes.
+            transforms of your own, each under the name of the key that it writes; or their classes,
+            which get `out_keys` and, if they have such arguments, `intrinsics` and
+            `prev_intrinsics`. A representation that one of them reads is computed, but not written
+            unless it is named, too.
         intrinsics: K `[3, 3]` of the sensor maps in pixels, or its key; raw, ego and obj need it,
             except for estimated raw flow. For `prev_intrinsics` see `RawFlow`.
         num_classes: number of semantic classes; seg and seg2 need it.
@@ -115,7 +120,10 @@ def representation_stack(
         Compose(
             FlowFactorize([('sensor', 'depth'), ('sensor', 'prev_from_curr')] -> ['ego']))
     """
-    chosen, foreign = _with_options(representations)
+    named, foreign = _with_options(representations, intrinsics, prev_intrinsics)
+    read = [key for transform in foreign.values() for key in transform.in_keys]
+    unnamed = {name: representation_options(name) for name in REPRESENTATIONS if name in read}
+    chosen = unnamed | named
     if num_classes is None and not {"seg", "seg2"}.isdisjoint(chosen):
         raise ValueError("representations seg and seg2 need num_classes=")
     estimator = _estimator_options(flow)
@@ -152,7 +160,7 @@ def representation_stack(
         transforms += [*sources, *_split(factors, unscaled, camera)]
     transforms += foreign.values()
     written = dict.fromkeys(key for transform in transforms for key in transform.out_keys)
-    shown = {*chosen, *_KEPT, *(key for each in foreign.values() for key in each.out_keys)}
+    shown = {*named, *_KEPT, *(key for each in foreign.values() for key in each.out_keys)}
     hidden = [key for key in written if key not in shown]
     return Compose(*transforms, *([DropKeys(*hidden)] if hidden else []))
 
@@ -186,7 +194,9 @@ def _known_options(whose: str, given: Any, known: Collection[str]) -> Arguments:
     return dict(given or {})
 
 
-def _with_options(representations: Representations) -> tuple[dict[str, Arguments], dict[str, Any]]:
+def _with_options(
+    representations: Representations, intrinsics: Any, prev_intrinsics: Any
+) -> tuple[dict[str, Arguments], dict[str, Any]]:
     """Returns the representations with all of their options, and the user's transforms, by name."""
     if isinstance(representations, str) or not representations:
         raise ValueError(
@@ -199,6 +209,9 @@ def _with_options(representations: Representations) -> tuple[dict[str, Arguments
         if name in chosen:
             raise ValueError(f"representation {name!r} is named twice")
         given = representations[name] if isinstance(representations, Mapping) else None
+        if callable(given) and not isinstance(given, Transform):
+            camera = {"intrinsics": intrinsics, "prev_intrinsics": prev_intrinsics}
+            given = given(out_keys=name, **{k: camera[k] for k in camera if asks_for(given, k)})
         if isinstance(given, Transform):
             if name in REPRESENTATIONS or name not in given.out_keys:
                 raise ValueError(
@@ -210,6 +223,15 @@ def _with_options(representations: Representations) -> tuple[dict[str, Arguments
         options = representation_options(name)
         chosen[name] = options | _known_options(f"representation {name!r}", given, options)
     return chosen, foreign
+
+
+def asks_for(maker: Callable[..., object], argument: str) -> bool:
+    """Returns whether a class or function has an argument that isn't given yet."""
+    given = getattr(maker, "keywords", {})  # of a functools.partial
+    function = getattr(maker, "func", maker)
+    if isinstance(function, type):  # TorchRL's metaclass hides the signature of a class
+        function = function.__init__  # type: ignore[misc]
+    return argument in inspect.signature(function).parameters and argument not in given
 
 
 def _estimator_options(flow: str | Mapping[str, Any]) -> Arguments | None:

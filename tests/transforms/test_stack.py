@@ -8,11 +8,12 @@ import functools
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.data import Unbounded
 from torchrl.envs import TransformedEnv, check_env_specs
 
 from flowrep import geometry
 from flowrep.transforms import REPRESENTATIONS, Depth, Segmentation, representation_stack
-from flowrep.transforms.base import MissingKey
+from flowrep.transforms.base import FLOW, MapTransform, MissingKey
 from tests.transforms.fake_env import INTRINSICS, NUM_CLASSES, FakeSensorEnv, moments
 from tests.transforms.test_motion import wide_frames
 
@@ -237,3 +238,25 @@ def test_estimated_motion_reads_noisy_depth_and_no_odometry():
     assert ("sensor", "prev_from_curr") not in read
     assert ("sensor", "noisy_depth") in build(["ego"])[-2].in_keys
     assert stack(["raw"], motion="estimated")[0].out_keys == ["raw", "raw_valid"]
+
+
+class Sideways(MapTransform):
+    """How far each pixel moves to the right, in focal lengths."""
+
+    def __init__(self, intrinsics, *, in_keys="raw", out_keys="sideways"):
+        super().__init__([FLOW], in_keys, out_keys)
+        self.fx = intrinsics[0][0]
+
+    def compute(self, raw):
+        return (raw[..., :1, :, :] / self.fx,)
+
+    def output_specs(self, raw):
+        return (Unbounded((*raw.shape[:-3], 1, *raw.shape[-2:])),)
+
+
+@pytest.mark.parametrize("named", [["ego"], ["ego", "raw"]])
+def test_a_users_map_gets_k_and_the_map_that_it_reads_which_is_written_if_named(named):
+    td = stack({**dict.fromkeys(named), "sideways": Sideways})(moments(3))
+    assert {*td.keys()} == {*named, "sideways", "sensor"}
+    raw = stack(["raw"])(moments(3))["raw"]
+    assert torch.equal(td["sideways"], raw[:, :1] / INTRINSICS[0][0])
