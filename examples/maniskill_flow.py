@@ -14,7 +14,7 @@ import gymnasium as gym
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from flowrep import diagnose, transforms
@@ -53,6 +53,9 @@ class ManiSkillEnv(EnvBase):
             for name, x in sensor.items()
         }
         spec["rgb"] = Bounded(0, 255, sensor["rgb"].shape, dtype=torch.uint8, device=self.device)
+        # The static world and M bodies: RawFlow compares this with the number of motions.
+        ids, rows = sensor["instance"], 1 + sensor["world_from_body"].shape[-3]
+        spec["instance"] = Categorical(rows, ids.shape, dtype=ids.dtype, device=self.device)
         self.observation_spec = Composite(sensor=Composite(spec, shape=batch), shape=batch)
         space = env.unwrapped.single_action_space
         low, high = (

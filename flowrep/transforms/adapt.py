@@ -220,7 +220,7 @@ class AdaptFlow(MapTransform):
         out_keys: Keys = "raw",
     ) -> None:
         check_flow_options(direction, grid, channels)
-        reads = Reads(("H", "W", 2), "float") if channels_last else base.FLOW
+        reads = Reads(("H", "W", 2), "float", spans_step=True) if channels_last else base.FLOW
         super().__init__([reads], in_keys, out_keys)
         check_distinct_keys(self)
         self.options: dict[str, Any] = {"direction": direction, "grid": grid, "channels": channels}

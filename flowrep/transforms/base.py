@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import inspect
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Sequence
 from typing import Any, Literal, NamedTuple, TypeAlias
@@ -30,11 +31,13 @@ class MissingKey(KeyError):
 class Reads(NamedTuple):
     """The layout that a transform expects under one input key, after any leading batch.
 
-    `shape` holds the trailing sizes: numbers are fixed, letters must agree between inputs.
+    `shape` holds the trailing sizes: numbers are fixed, names must agree between inputs. Motions
+    and flow `spans_step`: they are of the env's last step, even if that isn't observed as one.
     """
 
     shape: tuple[int | str, ...]
     kind: Literal["float", "integer", "any"] = "any"
+    spans_step: bool = False
 
     def __str__(self) -> str:
         """Returns the layout in the documentation's notation, e.g. `float [*B, 1, H, W]`."""
@@ -46,10 +49,12 @@ CALLS_PER_LOOK = 100  # on a GPU, one call of this many checks values: each chec
 
 DEPTH = Reads((1, "H", "W"), "float")
 IDS = Reads((1, "H", "W"), "integer")
-FLOW = Reads((2, "H", "W"), "float")
+FLOW = Reads((2, "H", "W"), "float", spans_step=True)
 RGB = Reads((3, "H", "W"), "integer")
-MOTION = Reads((4, 4), "float")
-MOTIONS = Reads(("N", 4, 4), "float")
+POSE = Reads((4, 4), "float")
+BODIES = Reads(("N", 4, 4), "float")  # poses, without the static world's
+MOTION = Reads((4, 4), "float", spans_step=True)
+MOTIONS = Reads(("1 + N", 4, 4), "float", spans_step=True)  # row 0 is the static world's
 
 
 class MapTransform(Transform):
@@ -72,7 +77,9 @@ class MapTransform(Transform):
         compiled: whether `compute` runs through `torch.compile`; False by default.
 
     Raises:
-        ValueError: the number of `in_keys` or `out_keys` is not the number of inputs or outputs.
+        TypeError: `reads` isn't a list of layouts, or `compute` or `output_specs` returns no tuple.
+        ValueError: the number of `in_keys` or `out_keys` is not that of inputs or outputs; or, in
+            an env, a motion or flow of its last step isn't that between two observations.
     """
 
     # Pure: takes one tensor per input key, returns one per output key.
@@ -84,6 +91,11 @@ class MapTransform(Transform):
         self, reads: Sequence[Reads], in_keys: Keys, out_keys: Keys, writes: int = 1
     ) -> None:
         super().__init__(in_keys=as_keys(in_keys), out_keys=as_keys(out_keys))
+        if not all(isinstance(each, Reads) for each in reads):
+            raise TypeError(
+                f"{type(self).__name__}: reads are layouts, one for each of in_keys, such as DEPTH "
+                f"or Reads((1, 'H', 'W'), 'float'); got {reads!r}"
+            )
         if len(self.in_keys) != len(reads):
             raise ValueError(
                 f"{type(self).__name__} reads {len(reads)} keys "
@@ -154,9 +166,18 @@ class MapTransform(Transform):
         compute = type(self).compute
         if self.compiled:
             compute = _compiled(compute)
-        for key, value in zip(self.out_keys, compute(self, *maps)):
-            next_tensordict.set(key, value)
+        self._write(next_tensordict, compute(self, *maps), "compute")
         return next_tensordict
+
+    def _write(self, into: Any, outputs: tuple[Any, ...], method: str) -> None:
+        """Writes what a method of a subclass returned under `out_keys`."""
+        if not isinstance(outputs, tuple) or len(outputs) != len(self.out_keys):
+            raise TypeError(
+                f"{type(self).__name__}.{method} should return a tuple, one item for each of "
+                f"{self.out_keys}; got {type(outputs).__name__}"
+            )
+        for key, value in zip(self.out_keys, outputs):
+            into[key] = value
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -196,9 +217,45 @@ class MapTransform(Transform):
         """Returns the specs including those of the outputs."""
         specs = self._inputs(observation_spec)
         observation_spec = observation_spec.clone()
-        for key, spec in zip(self.out_keys, self.output_specs(*specs)):
-            observation_spec[key] = spec
+        self._write(observation_spec, self.output_specs(*specs), "output_specs")
         return observation_spec
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        """Returns the specs unchanged; refuses what the env steps over, see `Raises`."""
+        input_spec = super().transform_input_spec(input_spec)
+        if self.container is not None:
+            self._check_steps(self._of_its_env())
+        return input_spec
+
+    def _of_its_env(self) -> list[Any]:
+        """Returns all transforms of the env, in their order."""
+        waiting, flat = [getattr(self.container, "transform", self)], []
+        while waiting:
+            transform = waiting.pop(0)
+            if isinstance(transform, Compose):
+                waiting = [*transform.transforms, *waiting]
+            else:
+                flat.append(transform)
+        return flat
+
+    def _check_steps(self, transforms: list[Any]) -> None:
+        """Raises ValueError if the env takes several steps where a motion or flow spans one."""
+        before = [x for x in transforms[: transforms.index(self)] if isinstance(x, MapTransform)]
+        written = {key for transform in before for key in transform.out_keys}
+        of_env = [
+            key for key, x in zip(self.in_keys, self.reads) if x.spans_step and key not in written
+        ]
+        if not of_env:
+            return
+        steppers = [type(x).__name__ for x in transforms if _methods_that_step(x)]
+        if self.container.base_env.__dict__.get("wrapper_frame_skip", 1) > 1:
+            steppers.append("frame_skip")
+        if steppers:
+            raise ValueError(
+                f"{of_env[0]!r} is of the env's last step, and {steppers[0]} takes several steps "
+                "between two observations. Let the env emit poses, which CameraMotion and "
+                "InstanceMotion compare with those of the previous observation"
+            )
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.in_keys} -> {self.out_keys})"
@@ -322,28 +379,27 @@ class RecurrentTransform(MapTransform):
         input_spec = super().transform_input_spec(input_spec)
         if self.parent is None:
             return input_spec
-        self._check_that_none_overwrites()
         observation_spec = self.transform_observation_spec(self.parent.observation_spec)
         for key in self.carried_keys:
             input_spec["full_state_spec"][key] = observation_spec[key].clone()
         return input_spec
 
-    def _check_that_none_overwrites(self) -> None:
-        """Raises ValueError if a later transform of the env writes to a carried key."""
-        later = False
-        transforms: list[Any] = [getattr(self.container, "transform", self)]
-        while transforms:
-            transform = transforms.pop(0)
-            if isinstance(transform, Compose):
-                transforms = [*transform.transforms, *transforms]
-                continue
-            if later and (keys := [key for key in self.carried_keys if key in transform.out_keys]):
+    def _check_steps(self, transforms: list[Any]) -> None:
+        """Raises ValueError, too, if a later transform changes what the next step reads."""
+        super()._check_steps(transforms)
+        for transform in transforms[transforms.index(self) + 1 :]:
+            if keys := [key for key in self.carried_keys if key in transform.out_keys]:
                 raise ValueError(
                     f"{type(transform).__name__} writes to {keys[0]!r}, which "
                     f"{type(self).__name__}, an earlier transform, reads again at the next step: "
                     "let it write to another key, or put it first"
                 )
-            later = later or transform is self
+            if "_reset" in _methods_that_step(transform):
+                raise ValueError(
+                    f"{type(transform).__name__} steps the env at a reset, and what "
+                    f"{type(self).__name__}, an earlier transform, writes is that of its last "
+                    "step, not of an episode's first frame: put it first"
+                )
 
 
 def as_keys(keys: Keys) -> list[NestedKey]:
@@ -376,6 +432,23 @@ def flags_of_batch(flags: Tensor, tensordict: TensorDictBase) -> Tensor:
     """Returns flags such as `done`, `[*B]` or `[*B, 1]`, as `[*B]`, the TensorDict's batch size."""
     batch_dims = tensordict.ndim
     return flags.flatten(batch_dims).any(-1) if flags.ndim > batch_dims else flags
+
+
+def _methods_that_step(transform: Transform) -> set[str]:
+    """Returns the names of a transform's methods that step its env, such as TorchRL's frame skip.
+
+    TorchRL has no flag for it. But a transform reaches its env as its `parent`, so a method's code
+    names this attribute beside a step.
+    """
+    code = {
+        name: {*inspect.unwrap(method).__code__.co_names}
+        for each in reversed(type(transform).__mro__)
+        if each not in Transform.__mro__
+        for name, method in vars(each).items()
+        if inspect.isfunction(method)
+    }
+    steps, env = {"step", "_step", "rand_step"}, {"parent", "base_env"}
+    return {name for name, names in code.items() if names & steps and names & env}
 
 
 @functools.cache

@@ -14,7 +14,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Categorical, Composite, TensorSpec, Unbounded
+from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 
 from flowrep import geometry
 from flowrep.geometry.checks import checked_number
@@ -225,7 +225,7 @@ class RawFlow(FlowTransform):
     | `("sensor", "instance_motion")` | `"raw_valid"` | as `"valid"` | | |
 
     Convention: p_t − p_t' on the current frame's grid, channels (u right, v down), t' the previous
-    step (Eq. 1 of the paper). Row i of `instance_motion` `[*B, N, 4, 4]` takes a point fixed to
+    step (Eq. 1 of the paper). Row i of `instance_motion` `[*B, 1 + N, 4, 4]` takes a point fixed to
     instance i from the current camera's frame into the previous camera's, at the previous step; row
     0 is the static world's. The observation thus holds everything that flow needs of the previous
     step: no state is kept, and shuffled samples of a replay buffer give the same flow as the env.
@@ -297,13 +297,16 @@ class RawFlow(FlowTransform):
         return self._chosen({"raw": flow}, valid)
 
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
-        """Returns the outputs' specs; ValueError if ids' spec has another number than motions'."""
+        """Returns the outputs' specs; ValueError unless ids' spec has a number for each motion."""
         _, ids, motions, *_ = specs
-        if isinstance(ids, Categorical) and ids.n != motions.shape[-3]:
+        bodies, rows = _highest_id(ids), motions.shape[-3]
+        if rows > 1 and bodies != rows - 1:  # without bodies, an id is wrong or the static world's
+            found = "has a spec of any id" if bodies is None else f"has ids from 0 to {bodies}"
             raise ValueError(
-                f"{self.in_keys[1]!r} has ids from 0 to {ids.n - 1}, and {self.in_keys[2]!r} has "
-                f"{motions.shape[-3]} rows: give InstanceIds one id for each body, in the order of "
-                "the poses"
+                f"{self.in_keys[1]!r} {found}, and {self.in_keys[2]!r} has {rows} rows: that must "
+                f"be 1 + N rows, the static world's first, and ids from 0 to N, declared as such. "
+                "(Poses are N, of bodies alone: InstanceMotion adds the static world's row.) "
+                "InstanceIds, with one id for each pose in their order, declares its ids"
             )
         return super().output_specs(*specs)
 
@@ -393,6 +396,16 @@ class FlowFactorize(FlowTransform):
             flows["raw"] = torch.where(raw[0].isfinite(), raw[0], 0.0)
             known = raw[0].isfinite().all(-3, keepdim=True)
         return self._chosen(flows, valid, known)
+
+
+def _highest_id(ids: TensorSpec) -> int | None:
+    """Returns the highest id of a spec, or None if it allows whatever its type can hold."""
+    if isinstance(ids, Categorical):
+        return int(ids.n) - 1
+    if not isinstance(ids, Bounded):
+        return None
+    highest = int(ids.space.high.max())
+    return None if highest == torch.iinfo(ids.dtype).max else highest
 
 
 def _map_size(maps: Sequence[Tensor | TensorSpec], reads: Sequence[Reads]) -> tuple[int, int]:

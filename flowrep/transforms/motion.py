@@ -59,7 +59,7 @@ class CameraMotion(RecurrentTransform):
         in_keys: Keys = ("sensor", "world_from_cam"),
         out_keys: Keys = ("sensor", "prev_from_curr"),
     ) -> None:
-        super().__init__([base.MOTION], in_keys, out_keys)
+        super().__init__([base.POSE], in_keys, out_keys)
 
     def advance(self, before: Sequence[Tensor], now: Sequence[Tensor]) -> tuple[Tensor]:
         """Returns `prev_from_curr`."""
@@ -78,8 +78,9 @@ class InstanceMotion(RecurrentTransform):
     | `("sensor", "world_from_cam")` | `("sensor", "instance_motion")` | float32 | | m |
     | `("sensor", "world_from_body")` | | `[*B, 1 + N, 4, 4]` | | |
 
-    Convention: see `flowrep.geometry.instance_motion`. `InstanceIds` converts a simulator's
-    instance ids to its rows, and `RawFlow` reads both. For the previous step's poses see
+    Convention: see `flowrep.geometry.instance_motion`. N poses, of bodies alone, become 1 + N
+    motions: row 0 is the static world's, which has no pose. `InstanceIds` converts a simulator's
+    instance ids to these rows, and `RawFlow` reads both. For the previous step's poses see
     `CameraMotion`.
 
     Args:
@@ -102,7 +103,7 @@ class InstanceMotion(RecurrentTransform):
         self, *, in_keys: Keys | None = None, out_keys: Keys = ("sensor", "instance_motion")
     ) -> None:
         keys = _POSES if in_keys is None else in_keys
-        super().__init__([base.MOTION, base.MOTIONS], keys, out_keys)
+        super().__init__([base.POSE, base.BODIES], keys, out_keys)
 
     def advance(self, before: Sequence[Tensor], now: Sequence[Tensor]) -> tuple[Tensor]:
         """Returns `instance_motion`."""

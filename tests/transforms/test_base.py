@@ -12,11 +12,18 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import TransformedEnv
-from torchrl.envs.transforms import Compose
+from torchrl.envs.transforms import Compose, FrameSkipTransform, NoopResetEnv, Transform
 
 from flowrep import transforms as T
+from flowrep.geometry import ego_flow
 from flowrep.transforms.stack import DropKeys
-from tests.transforms.fake_env import INTRINSICS, FakeSensorEnv, SelfResettingEnv, moments
+from tests.transforms.fake_env import (
+    INTRINSICS,
+    FakeSensorEnv,
+    SelfResettingEnv,
+    camera_motion,
+    moments,
+)
 from tests.transforms.oracles import brightening, same_bits
 
 COMPILE = torch.compile
@@ -91,7 +98,7 @@ def test_keywords_instead_of_a_tensordict():
         ("depth", torch.ones(2, 1, 5, 7).long(), r"float \[\*B, 1, H, W\].*got torch.int64"),
         ("instance", torch.ones(2, 1, 5, 7), r"integer \[\*B, 1, H, W\].*got torch.float32"),
         ("instance", torch.ones(2, 1, 7, 5).byte(), r"H = 5, W = 7.*\[2, 1, 7, 5\]"),
-        ("instance_motion", torch.eye(4).expand(2, 4, 4), r"\[\*B, N, 4, 4\].*\[2, 4, 4\]"),
+        ("instance_motion", torch.eye(4).expand(2, 4, 4), r"\[\*B, 1 \+ N, 4, 4\].*\[2, 4, 4\]"),
     ],
 )
 def test_wrong_layout_is_refused_on_a_batch(key, value, expected):
@@ -120,6 +127,65 @@ def test_wrong_number_of_keys_is_refused():
         T.RawFlow(INTRINSICS, in_keys=["depth"])
     with pytest.raises(ValueError, match=r"writes 2 keys, out_keys has \['ego'\]"):
         T.FlowFactorize(INTRINSICS, out_keys=["ego"])
+
+
+def test_a_transform_made_wrong_is_told_what_is_wrong():
+    with pytest.raises(TypeError, match=r"MapTransform: reads are layouts.*DEPTH.*\['raw'\]"):
+        T.base.MapTransform(["raw"], "raw", "out")
+
+    class Bare(T.Depth):
+        def compute(self, depth):
+            return depth
+
+    with pytest.raises(TypeError, match=r"Bare.compute should return a tuple.*'depth'.*Tensor"):
+        Bare()(moments(2))
+
+
+class OwnSkip(Transform):
+    """Steps the env twice, as whoever writes a frame skip for themselves does."""
+
+    def _step(self, tensordict, next_tensordict):
+        return self.parent.step(tensordict)["next"]
+
+
+def noop() -> Transform:
+    return NoopResetEnv(1, random=False)
+
+
+def by_motions() -> list[Transform]:
+    return [T.FlowFactorize(INTRINSICS, outputs=["ego"])]
+
+
+def by_poses() -> list[Transform]:
+    keys = [("sensor", "depth"), "motion"]
+    return [
+        T.CameraMotion(out_keys="motion"),
+        T.FlowFactorize(INTRINSICS, outputs=["ego"], in_keys=keys),
+    ]
+
+
+@pytest.mark.parametrize("make", [lambda: FrameSkipTransform(2), noop, OwnSkip])
+@pytest.mark.parametrize("is_first", [True, False])
+def test_the_motion_of_the_envs_last_step_is_refused_where_others_step_it(make, is_first):
+    parts = [make(), *by_motions()] if is_first else [*by_motions(), make()]
+    with pytest.raises(ValueError, match=r"'prev_from_curr'.*steps.*poses.*CameraMotion"):
+        TransformedEnv(FakeSensorEnv(), Compose(*parts)).rollout(1)
+
+
+@pytest.mark.parametrize("is_first", [True, False])
+def test_poses_give_the_flow_between_two_observations_though_a_frame_lies_between(is_first):
+    skip = FrameSkipTransform(2)
+    parts = [skip, *by_poses()] if is_first else [*by_poses(), skip]
+    seen = TransformedEnv(FakeSensorEnv(), Compose(*parts)).rollout(1)["next"]
+    once = camera_motion(1, 0)
+    want = ego_flow(seen["sensor", "depth"], torch.tensor(INTRINSICS), once @ camera_motion(2, 0))
+    torch.testing.assert_close(seen["ego"], want.flow, atol=1e-4, rtol=1e-4)
+
+
+def test_what_steps_the_env_at_a_reset_comes_before_what_compares_steps():
+    env = TransformedEnv(FakeSensorEnv(), Compose(*by_poses(), noop()))
+    with pytest.raises(ValueError, match=r"NoopResetEnv.*CameraMotion.*put it first"):
+        env.rollout(1)
 
 
 def test_all_that_is_computed_from_a_first_frame_is_what_a_reset_would_give():

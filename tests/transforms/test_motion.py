@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import Unbounded
+from torchrl.data import Bounded, Unbounded
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
@@ -14,10 +14,11 @@ from flowrep.transforms import (
     CameraMotion,
     EstimateCameraMotion,
     FlowFactorize,
+    InstanceMotion,
     RawFlow,
 )
 from flowrep.transforms.base import IDS, RecurrentTransform
-from tests.transforms.fake_env import FakeSensorEnv, frame_motions
+from tests.transforms.fake_env import INTRINSICS, FakeSensorEnv, frame_motions
 
 MOTION = "motion"
 
@@ -79,6 +80,41 @@ def test_two_cameras_that_share_a_pose_s_key_are_refused():
     TransformedEnv(FakeSensorEnv(), camera()).rollout(2)
     with pytest.raises(ValueError, match="AdaptPose writes to 'pose', which CameraMotion"):
         TransformedEnv(FakeSensorEnv(), Compose(camera(), camera())).rollout(2)
+
+
+class WithRows(FakeSensorEnv):
+    """Has a row for the static world before the bodies' poses, or ids whose spec counts nothing."""
+
+    def __init__(self, *, static_row=False, ids=None):
+        super().__init__()
+        self.static_row = static_row
+        spec = self.observation_spec["sensor"].clone()
+        spec["world_from_body"] = Unbounded((2 + static_row, 4, 4), dtype=torch.float64)
+        spec["instance"] = spec["instance"] if ids is None else ids
+        self.observation_spec["sensor"] = spec
+
+    def _observe(self):
+        seen, static = super()._observe(), torch.eye(4).double()[None]
+        if self.static_row:
+            seen["sensor", "world_from_body"] = torch.cat(
+                [static, seen["sensor", "world_from_body"]]
+            )
+        return seen
+
+
+def test_no_body_gets_its_neighbours_motion():
+    def flow(**options):
+        keys = [("sensor", "depth"), ("sensor", "instance"), "motions"]
+        stack = Compose(InstanceMotion(out_keys="motions"), RawFlow(INTRINSICS, in_keys=keys))
+        return TransformedEnv(WithRows(**options), stack).rollout(1)["next", "raw"]
+
+    shape = (1, 5, 7)
+    assert flow(ids=Bounded(0, 2, shape, dtype=torch.uint8)).isfinite().all()
+    with pytest.raises(ValueError, match=r"ids from 0 to 2.*4 rows.*1 \+ N.*bodies alone"):
+        flow(static_row=True)
+    for ids in (Unbounded(shape, dtype=torch.uint8), Bounded(0, 255, shape, dtype=torch.uint8)):
+        with pytest.raises(ValueError, match=r"any id.*InstanceIds"):
+            flow(ids=ids)
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
