@@ -16,7 +16,7 @@ from flowrep.experiment import build
 from flowrep.experiment.agents import Agent
 from flowrep.experiment.film import Film
 from flowrep.experiment.run import RunFolder
-from flowrep.experiment.schema import EvaluateConfig, ViewConfig
+from flowrep.experiment.schema import EvaluateConfig
 from flowrep.geometry import ego_flow
 from flowrep.train import resumed
 from tests.config.composing import composed, plain
@@ -105,20 +105,6 @@ def stored_config(run, *typed):
     """What a resumed run has for its config."""
     asked = composed("debug=smoke", f"resume={run.path}", *typed)
     return resumed(asked, run, [f"resume={run.path}", *typed])
-
-
-@pytest.mark.parametrize("typed", [[], ["+representations.contact._target_=mine.Other"]])
-def test_a_stored_run_names_no_code(config, folder, typed):
-    run = RunFolder(folder / "run")
-    run.write_config(config.plain())
-    for use in (
-        lambda: stored_config(run, *typed),
-        lambda: Agent.load(run.path, trusted=command(ViewConfig, "view", *typed).trusted),
-        lambda: run.config(command(EvaluateConfig, "evaluate", "run=x", *typed).trusted),
-    ):
-        with pytest.raises(UsageError, match=re.escape(TYPED)):
-            use()
-    assert "mine" not in sys.modules
 
 
 def test_what_the_user_typed_is_used(config, folder):

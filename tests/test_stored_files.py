@@ -2,6 +2,7 @@
 
 import io
 import os
+import re
 import sys
 from contextlib import suppress
 from dataclasses import asdict
@@ -31,18 +32,22 @@ from flowrep.view import agent_of
 from tests.config.composing import composed, plain
 from tests.experiment.test_run import episode
 
+ALGORITHM, MAP = KEYS = "algorithm._target_", "+representations.edges._target_"
 EVIL = "import pathlib; pathlib.Path(__file__).with_name('PWNED').touch()\nclass A: pass\n"
 
 
 @pytest.fixture
 def stranger(tmp_path, monkeypatch):
-    """Makes a run whose config names an algorithm in its folder, which can be imported."""
+    """Makes a run whose config names a class in its folder, which can be imported."""
     monkeypatch.syspath_prepend(tmp_path)  # as the working directory is with python -m
     (tmp_path / "evil.py").write_text(EVIL)
 
-    def make(target="evil.A"):
+    def make(key, target="evil.A"):
         config = plain("train", "debug=smoke", "device=cpu")
-        config["algorithm"] = {"_target_": target}
+        if key == ALGORITHM:
+            config["algorithm"] = {"_target_": target}
+        else:
+            config["representations"] = {"edges": {"_target_": target}}
         run = RunFolder(tmp_path)
         run.write_config(config)
         return run
@@ -80,31 +85,36 @@ USES = [resume, evaluate, view, repeated_sweep, packed]
 
 
 @pytest.mark.parametrize("use", USES)
+@pytest.mark.parametrize("key", KEYS)
 @pytest.mark.parametrize("target", ["evil.A", "os.system", "flowrep.agent.load_checkpoint"])
-def test_a_stored_run_names_no_code(stranger, use, target):
-    run = stranger(target)
+def test_a_stored_run_names_no_code(stranger, use, key, target):
+    run = stranger(key, target)
     with pytest.raises(UsageError) as refused:
         use(run)
-    assert f"algorithm._target_={target}" in str(refused.value).split()  # what to type
+    assert f"{key}={target}" in str(refused.value).split()  # what to type
     assert not (run.path / "PWNED").exists()
     assert "evil" not in sys.modules
 
 
 @pytest.mark.parametrize("use", USES[:3])
-def test_another_name_on_the_command_line_is_not_the_stored_one(stranger, use):
-    run = stranger()
-    with pytest.raises(UsageError, match=r"algorithm\._target_=evil\.A$"):
-        use(run, "algorithm._target_=evil.B")
+@pytest.mark.parametrize("key", KEYS)
+def test_another_name_on_the_command_line_is_not_the_stored_one(stranger, use, key):
+    run = stranger(key)
+    with pytest.raises(UsageError, match=rf"{re.escape(key)}=evil\.A$"):
+        use(run, f"{key}=evil.B")
     assert not (run.path / "PWNED").exists()
 
 
-def test_what_the_user_typed_is_imported(stranger):
-    run = stranger()
+@pytest.mark.parametrize("key", KEYS)
+def test_what_the_user_typed_is_imported(stranger, key):
     for use in (evaluate, view):
         # past the config: there is no checkpoint
         with pytest.raises(CheckpointError, match=r"latest\.safetensors"):
-            use(run, "algorithm._target_=evil.A")
-    config = resume(run, "algorithm._target_=evil.A")
+            use(stranger(key), f"{key}=evil.A")
+
+
+def test_a_run_is_resumed_with_the_algorithm_that_the_user_typed(stranger):
+    config = resume(stranger(ALGORITHM), "algorithm._target_=evil.A")
     assert config.algorithm.target == "evil.A"
     assert config.plain()["algorithm"] == {"_target_": "evil.A"}  # and no option of another
 
@@ -121,7 +131,7 @@ def test_an_algorithm_typed_for_a_run_that_has_another_is_not_ignored(tmp_path):
 )
 def test_a_name_that_no_class_can_have_is_not_offered_as_an_override(stranger, target):
     with pytest.raises(UsageError) as refused:
-        evaluate(stranger(target))
+        evaluate(stranger(ALGORITHM, target))
     assert "algorithm._target_=" not in str(refused.value)
     assert str(refused.value).isprintable()
 
