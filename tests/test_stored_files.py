@@ -234,7 +234,7 @@ def test_no_pipe_in_a_run_is_waited_for(tmp_path):
 
 @pytest.mark.parametrize("text", ["../../x", "a/b", "", "x" * 65, "a\nb"])
 def test_a_wandb_id_that_is_a_path_is_refused(tmp_path, monkeypatch, text):
-    monkeypatch.setattr("flowrep.experiment.loggers.require", lambda *_: None)
+    monkeypatch.setattr("flowrep.experiment.run.require", lambda *_: None)
     monkeypatch.setitem(sys.modules, "wandb", object())
     (tmp_path / "wandb_id").write_text(text)
     with pytest.raises(UsageError, match="wandb_id"):

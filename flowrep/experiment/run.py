@@ -9,14 +9,18 @@ from __future__ import annotations
 import json
 import os
 import platform
+import re
 import shutil
 import subprocess
+import uuid
 import zipfile
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from operator import itemgetter
 from pathlib import Path
+from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,18 +31,20 @@ from numpy.typing import NDArray
 from flowrep import __version__
 from flowrep.config.usage import UsageError
 from flowrep.config.yaml_file import read_yaml
-from flowrep.experiment.loggers import Loggers
 from flowrep.experiment.outcomes import (
     EVALUATION_COLUMNS,
+    OUTCOMES,
     EpisodeKey,
     EpisodeRecord,
     read_episodes,
 )
 from flowrep.experiment.schema import TrainConfig, validated_run
+from flowrep.extras import require
 from flowrep.files import (
     TableError,
     append_rows,
     is_whole,
+    naming,
     read_rows,
     refuse_link,
     replace_file,
@@ -50,6 +56,7 @@ from flowrep.files import (
 
 if TYPE_CHECKING:
     import torch
+    from torchrl.record.loggers import TensorboardLogger
 
 
 class RunFolderError(ValueError):
@@ -159,6 +166,74 @@ def read_drives(path: Path) -> dict[EpisodeKey, tuple[str, NDArray[np.float32]]]
             return dict(zip(map(EpisodeKey._make, names), driven, strict=True))
     except Exception as error:  # zip, zlib and numpy fail on garbage in a dozen ways
         raise TableError(f"{path}: {error}") from error
+
+
+class Loggers:
+    """Logs to TensorBoard in a run's folder and, after `add_wandb`, to Weights & Biases."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._tensorboard: TensorboardLogger | None = None
+        self._wandb: Any = None
+
+    def log(self, frames: int, values: Mapping[str, float]) -> None:
+        """Logs values by title."""
+        events = self._folder / "tensorboard"
+        if not events.is_dir():  # new, or somebody removed it, so that the old writer would fail
+            self._tensorboard = None
+        with naming(events):
+            if self._tensorboard is None:
+                # Imports PyTorch, before which commands open their folders.
+                from torchrl.record.loggers import TensorboardLogger
+
+                self._tensorboard = TensorboardLogger(events.name, str(self._folder))
+            for logger in filter(None, (self._tensorboard, self._wandb)):
+                logger.log_metrics(dict(values), frames)
+
+    def log_episodes(self, records: Sequence[EpisodeRecord]) -> None:
+        """Logs shares of outcomes, mean return and mean length, by scene, condition and policy."""
+        values: dict[str, list[float]] = defaultdict(list)
+        for each in records:
+            # "training" would be taken for the episodes from which the agent learns.
+            kind = each.evaluation.replace("training", "evaluation")
+            title = "/".join((kind, each.scene, each.speed, f"{each.fps:g}fps", each.policy))
+            for name in OUTCOMES:
+                values[f"{title}/{name}"].append(each.outcome == name)
+            values[f"{title}/return"].append(each.return_)
+            values[f"{title}/length"].append(each.length)
+        self.log(records[0].frames, {title: fmean(all_) for title, all_ in values.items()})
+
+    def flush(self) -> None:
+        """Writes what TensorBoard's writer still holds."""
+        if self._tensorboard is not None:
+            self._tensorboard.experiment.flush()
+
+    def add_wandb(self, mode: str, config: Mapping[str, Any]) -> None:
+        """Sends everything logged from now on to Weights & Biases too, unless `mode` is "off".
+
+        A resumed run continues its wandb run, whose id is in the folder.
+        """
+        if mode == "off":
+            return
+        require(f"wandb={mode}", "train,wandb", "wandb")
+        kept = self._folder / "wandb_id"
+        if not kept.is_file():
+            replace_text(kept, uuid.uuid4().hex[:12])
+        name = kept.read_text(encoding="utf-8")
+        if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name):  # it becomes a part of paths
+            raise UsageError(f"{kept} does not hold a wandb run's id: restore or remove it")
+
+        from torchrl.record.loggers.wandb import WandbLogger
+
+        self._wandb = WandbLogger(
+            self._folder.name,
+            project="flowrep",
+            save_dir=str(self._folder),
+            id=name,
+            mode=mode,
+            config=dict(config),
+            log_env_packages=False,
+        )
 
 
 class RunFolder:
