@@ -69,19 +69,18 @@ def run(config: EvaluateConfig) -> None:
 
 def candidates_of(config: EvaluateConfig) -> list[Candidate]:
     """Returns the agents to evaluate: of runs and sweeps, or policies from other projects."""
+    from flowrep.experiment.policies import ForeignPolicy, SavedPolicy, policy_of
     from flowrep.experiment.run import RunFolder
 
     runs: dict[Path, RunFolder] = {}  # each run once, even if it is named in several ways
     for path in config.run or []:
         for run in RunFolder.all_in(path):
             runs.setdefault(run.path.resolve(), run)
-
-    from flowrep.experiment.agents import Agent
-    from flowrep.experiment.policies import ForeignPolicy, SavedPolicy, policy_of
-
     for name in config.other_policies:
         if not isinstance(policy_of(name), ForeignPolicy | SavedPolicy):
             raise UsageError(f"policy={name}: evaluate a run by run=, a baseline by baselines=")
+
+    from flowrep.experiment.agents import Agent
 
     machine = config.model_dump(include={"device", "num_envs", "num_workers"})
     if not config.other_policies:

@@ -22,6 +22,7 @@ from hydra.core.hydra_config import HydraConfig
 from flowrep.config.cli import run_command
 from flowrep.config.folders import folder_name
 from flowrep.config.usage import UsageError
+from flowrep.experiment.policies import policy_of
 from flowrep.experiment.schema import ViewConfig
 from flowrep.files import replace_files, write_rows
 from flowrep.progress import progress_bar
@@ -40,12 +41,13 @@ FILES = ("sheet.png", "episode.mp4", "plan.png", "episodes.csv")
 
 def run(config: ViewConfig) -> None:
     """Writes pictures, a film and tables of the scene."""
-    from flowrep.experiment.film import Film
-
     keys = [text.partition("=")[0].lstrip("+") for text in HydraConfig.get().overrides.task]
     changed = [key for key in keys if key.startswith("scene.")]
     if keeps_scene(config, "scene" in keys) and changed:
         raise UsageError(f"{changed[0]}= changes a scene: add scene=, which names it")
+
+    from flowrep.experiment.film import Film
+
     agent = agent_of(config, "scene" in keys)
     with closing(Film(agent, **street_of(config))) as film:
         view(config, agent, film)
@@ -53,8 +55,6 @@ def run(config: ViewConfig) -> None:
 
 def keeps_scene(config: ViewConfig, is_scene_given: bool) -> bool:
     """Returns whether a trained agent drives in the scene of its training."""
-    from flowrep.experiment.policies import policy_of
-
     return policy_of(config.policy).has_scene and not is_scene_given
 
 

@@ -1,4 +1,7 @@
-"""What `policy=` names, a class a kind: a run, a saved agent, a baseline, a foreign policy."""
+"""What `policy=` names, a class a kind: a run, a saved agent, a baseline, a foreign policy.
+
+Commands check names before they import PyTorch, so here only what loads a policy imports it.
+"""
 
 from __future__ import annotations
 
@@ -12,25 +15,20 @@ from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, get_args
 
-import torch
-from tensordict import TensorDictBase
-from torch import Tensor
-from torch.export.passes import move_to_device_pass
-from torchrl.data import Composite, TensorSpec
-
-from flowrep.agent import CheckpointError, load_checkpoint
-from flowrep.baselines import BASELINES
 from flowrep.config.cli import composed
-from flowrep.config.options import validated
+from flowrep.config.options import BaselineName, validated
 from flowrep.config.usage import UsageError, closest_first
-from flowrep.envs import street_envs
-from flowrep.experiment import build
 from flowrep.experiment.run import RunFolder, check_origin, origin_of
 from flowrep.experiment.schema import EnvConfig, Machine, TrainConfig, validated_run
 from flowrep.scenes import Scene, load_scene
-from flowrep.transforms.stack import REPRESENTATIONS, representation_options
+
+if TYPE_CHECKING:
+    import torch
+    from tensordict import TensorDictBase
+    from torch import Tensor
+    from torchrl.data import Composite, TensorSpec
 
 PRETRAINED = Path(__file__).parents[1] / "pretrained"
 """Agents that come with flowrep, one for each scene; README.md there is their card."""
@@ -42,7 +40,7 @@ Stored = tuple[TrainConfig, dict[str, Any], Path]
 def policy_of(name: str | Path) -> NamedPolicy:
     """Returns what `policy=` names; raises UsageError if that is nothing."""
     name = str(name)
-    if name in BASELINES:
+    if name in get_args(BaselineName):
         return Baseline(name)
     if Path(name).is_dir():  # its name may hold a colon
         return RunPolicy(name)
@@ -51,7 +49,7 @@ def policy_of(name: str | Path) -> NamedPolicy:
     if ":" in name or name.endswith(".pt2"):
         return ForeignPolicy(name)
     raise UsageError(
-        f"policy={name}: give {', '.join(BASELINES)}, pretrained, a run's folder, "
+        f"policy={name}: give {', '.join(get_args(BaselineName))}, pretrained, a run's folder, "
         "path.safetensors, path.py:make, package.module:make or path.pt2"
     )
 
@@ -98,6 +96,9 @@ class TrainedPolicy(NamedPolicy):
 
     def load(self, env: Mapping[str, Any], trusted: Collection[str], precision: Any) -> Loaded:
         """Returns the network with its weights, with `precision` in that number format."""
+        from flowrep.agent import CheckpointError
+        from flowrep.experiment import build
+
         maps = env.get("representations")
         # `_target_` alone is no map: it trusts a class that a run names, as `trusted` does.
         if isinstance(maps, Mapping) and all({*(x or {})} == {"_target_"} for x in maps.values()):
@@ -139,6 +140,8 @@ class RunPolicy(TrainedPolicy):
 
     def stored(self, scene: Scene | None, trusted: Collection[str]) -> Stored:
         """Reads the last checkpoint."""
+        from flowrep.agent import load_checkpoint
+
         run = RunFolder.existing(self.name)
         config, path = run.config(trusted), run.checkpoint_path
         state = load_checkpoint(path, ["origin", "frames", "policy"])
@@ -152,14 +155,21 @@ class SavedPolicy(TrainedPolicy):
     def __init__(self, name: str) -> None:
         super().__init__(name)
         self.has_scene = name != "pretrained"
-        if self.has_scene and not Path(name).is_file():
-            raise UsageError(f"policy={name}: there is no such file")
+        if self.has_scene:
+            _check_is_there(name, name)
 
     def stored(self, scene: Scene | None, trusted: Collection[str]) -> Stored:
         """Reads the file."""
+        from flowrep.agent import load_checkpoint
+
         path = Path(self.name) if self.has_scene else _pretrained(scene)
         state = load_checkpoint(path, ["config", "frames", "policy"])
         return validated_run(state["config"], path.name, trusted), state, path
+
+
+def _check_is_there(name: str, file: str) -> None:
+    if not Path(file).is_file():
+        raise UsageError(f"policy={name}: there is no file '{file}'")
 
 
 def _pretrained(scene: Scene | None) -> Path:
@@ -183,6 +193,8 @@ def packed(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     A weight is rounded to 1/127 of the largest in its row. That is coarser than bfloat16, in which
     agents compute; README.md of the pretrained agents gives the success of one with and without it.
     """
+    import torch
+
     stored = {}
     for name, weight in weights.items():
         stored[name] = weight
@@ -197,6 +209,7 @@ def packed(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def unpacked(stored: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Returns the weights that `packed` stored; others are unchanged.
 
+    >>> import torch
     >>> weights = {"weight": torch.tensor([[1.0, -0.5], [0.0, 0.0]])}
     >>> unpacked(packed(weights))["weight"]
     tensor([[ 1.0000, -0.5039],
@@ -228,6 +241,8 @@ def _env_config(given: Mapping[str, Any]) -> EnvConfig:
 
 def _whole_options(name: str) -> dict[str, Any]:
     """Returns a representation's options with their defaults, none for one of the user's."""
+    from flowrep.transforms.stack import REPRESENTATIONS, representation_options
+
     return representation_options(name) if name in REPRESENTATIONS else {}
 
 
@@ -260,8 +275,20 @@ class ForeignPolicy(NamedPolicy):
 
     takes = (*NamedPolicy.takes, "representations", "flow", "motion", "noise")
 
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        file = name if name.endswith(".pt2") else name.rpartition(":")[0]
+        if file.endswith((".py", ".pt2")):
+            _check_is_there(name, file)
+
     def load(self, env: Mapping[str, Any], trusted: Collection[str], precision: Any) -> Loaded:
         """Returns the policy, built for the task in the env."""
+        import torch
+        from torchrl.data import Composite
+
+        from flowrep.envs import street_envs
+        from flowrep.experiment import build
+
         given = self._given({**env, "precision": precision})
         if not given.get("representations"):
             raise UsageError(f"representations needs a value for policy={self.name}")
@@ -305,6 +332,9 @@ class ForeignFunction:
 
     def __call__(self, maps: TensorDictBase) -> TensorDictBase:
         """Returns the maps with `action`."""
+        import torch
+        from tensordict import TensorDictBase
+
         # A copy, since the env reads the maps again if the policy changes them.
         seen = maps.select(*self._task.representations, "env_id", "is_init").clone()
         with _naming_policy(self.name):
@@ -335,7 +365,7 @@ _FOLDERS: set[Path] = set()  # of the scripts that were loaded
 def _module(name: str) -> Any:
     if not name.endswith(".py"):
         return import_module(name)
-    path = Path(name).resolve(strict=True)
+    path = Path(name).resolve()
     # Under a name that an earlier script imported, Python would give this one the same module.
     for loaded, module in list(sys.modules.items()):
         file = Path(getattr(module, "__file__", None) or "/")
@@ -353,7 +383,9 @@ def _module(name: str) -> Any:
 
 
 def _program(path: str, task: Task) -> Callable[[TensorDictBase], Tensor]:
-    Path(path).resolve(strict=True)
+    import torch
+    from torch.export.passes import move_to_device_pass
+
     logger = logging.getLogger("torch.export")  # prints the traceback of a damaged file
     was_disabled, logger.disabled = logger.disabled, True
     try:

@@ -308,7 +308,7 @@ class RunFolder:
     def begin(self, config: TrainConfig, overrides: Iterable[str]) -> None:
         """Writes a new run's config and overrides."""
         self.check_is_new()
-        (self.path / ".hydra").mkdir(exist_ok=True)  # where Hydra keeps the overrides
+        (self.path / ".hydra").mkdir(parents=True, exist_ok=True)  # where Hydra keeps the overrides
         typed = yaml.safe_dump(list(overrides), allow_unicode=True)
         replace_text(self.path / ".hydra" / "overrides.yaml", typed)
         self.write_config(config.plain())

@@ -7,6 +7,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Categorical, Composite, Unbounded
 
+from flowrep.config.usage import UsageError
 from flowrep.experiment.policies import ForeignFunction, ForeignPolicy, PolicyError, Task
 
 TASK = Task(
@@ -147,7 +148,7 @@ def test_what_fails_in_a_policy_is_one_line_with_its_place(tmp_path, body, name,
 def test_what_is_not_there_or_damaged_is_named(name, tmp_path):
     (tmp_path / "agent.pt2").write_text("something else")
     for each in (name, f"{tmp_path}/agent.pt2"):
-        with pytest.raises(PolicyError, match=each.partition(".")[0]):
+        with pytest.raises((PolicyError, UsageError), match=each.partition(".")[0]):
             ForeignPolicy(each).built_for(TASK)
 
 

@@ -121,6 +121,7 @@ def new_run(
         "device=cpu", "seed=7", f"algorithm={algorithm}", f"noise={noise}",
         f"num_workers={num_workers}", *small, *more,
     )  # fmt: skip
+    folder.mkdir(exist_ok=True)
     runner = Runner(config, RunFolder(folder))
     if resume:
         runner.load()
