@@ -119,7 +119,7 @@ class Runner:
                     bar.set_postfix_str(progress_text(row))
                 if evaluate(self.frames):
                     self.evaluation_pending = not self.evaluate("training", stop)
-                if save(self.frames):
+                if save(self.frames) and self.frames < total:  # the last state is saved below
                     self.save()
         self.save()
 

@@ -15,6 +15,7 @@ from flowrep.geometry.checks import check_name
 from flowrep.transforms.base import Keys, MissingKey, as_keys
 
 Images = Literal["half", "both", "all"]
+_INTEGERS = {1: torch.uint8, 2: torch.int16, 4: torch.int32, 8: torch.int64}  # by bytes
 
 
 class Mirror(Transform):
@@ -156,15 +157,20 @@ class Mirror(Transform):
 
 def mirror_map(x: Tensor, chosen: Tensor, twice_cx: int | None, *, is_flow: bool) -> Tensor:
     """Returns maps `[*B, C, H, W]`, the `chosen` `[*B]` of them mirrored; see `Mirror`."""
-    width = x.shape[-1]
-    column = torch.arange(width, device=x.device)
-    opposite = ((width if twice_cx is None else twice_cx) - 1 - column).clamp(0, width - 1)
-    chosen = chosen[..., None, None, None]
-    # One pass over the maps: a gather takes half the time of a flip and a `where` of the two.
-    x = x.gather(-1, torch.where(chosen, opposite, column).expand(x.shape))
+    # As integers, because PyTorch reverses floats of two bytes five times as slowly.
+    bits = x.view(_INTEGERS[x.element_size()])
+    image = bits.flip(-1)
+    shift = 0 if twice_cx is None else twice_cx - x.shape[-1]
+    if shift:  # columns beyond the border take the nearest one
+        border = image[..., :1] if shift > 0 else image[..., -1:]
+        border = border.expand(*image.shape[:-1], abs(shift))
+        parts = [border, image[..., :-shift]] if shift > 0 else [image[..., -shift:], border]
+        image = torch.cat(parts, -1)
     if is_flow:
-        x[..., ::2, :, :].mul_(torch.where(chosen, -1, 1).to(x.dtype))  # the gathered copy's u
-    return x
+        image.view(x.dtype)[..., ::2, :, :].neg_()  # u
+    # The image's bits where `chosen`, else those of x, in half the time of `torch.where`.
+    mask = -chosen.to(bits.dtype)[..., None, None, None]
+    return image.bitwise_xor_(bits).bitwise_and_(mask).bitwise_xor_(bits).view(x.dtype)
 
 
 def _twice_cx(intrinsics: Any) -> int:
