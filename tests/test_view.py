@@ -89,14 +89,14 @@ def test_a_run_drives_in_its_scene_and_a_policy_from_a_file_in_the_one_asked_for
     assert [e.outcome for e in ended[f"{path}:make"]] == [e.outcome for e in never]
 
 
-def test_a_view_has_the_speed_and_the_frame_rate_that_were_asked_for():
+def test_a_view_has_the_speed_and_the_frame_rate_asked_for():
     (episode,) = driven(asked("fps=6", "speed=high", "scene.time_limit_steps=12", "episodes=1"))
     assert (episode.fps, episode.speed) == (6.0, "high")
     (episode,) = driven(asked("scene.frame_rate_hz=8", "scene.time_limit_steps=12", "episodes=1"))
     assert (episode.fps, episode.speed) == (8.0, "normal")
 
 
-def test_a_folder_belongs_to_a_scene_and_a_policy():
+def test_each_scene_and_policy_has_a_folder():
     scenes = [load_scene(name) for name in ("straight_road", "s_turn")]
     policies = "planner", "outputs/a run/", "outputs/another", "../mine.py:make"
     folders = {folder_of(asked(f"policy='{p}'"), s) for p in policies for s in scenes}
@@ -141,7 +141,7 @@ def test_a_policy_from_a_file_needs_its_representations():
         driven(asked("policy=mine:make"))
 
 
-def test_every_episode_takes_the_path_that_was_asked_for():
+def test_every_episode_takes_the_path_asked_for():
     config = asked("policy=never_turn", "scene=three_way_junction", "path=right", "episodes=6")
     assert [episode.path for episode in driven(config)] == ["right"] * 6
 

@@ -35,7 +35,7 @@ def film_of():
         film.close()
 
 
-def test_a_film_is_of_the_episode_that_names_it(film_of):
+def test_a_drive_has_a_frame_for_each_step_of_the_episode_that_was_asked_for(film_of):
     film, sensors = film_of("representations=[seg]"), []
     frames, episode = film.drive(
         {"episode_seed": 2_000_017}, lambda tensordict: sensors.append(tensordict["sensor"][0])
@@ -53,7 +53,7 @@ def test_a_film_is_of_the_episode_that_names_it(film_of):
     assert turned[1] == pytest.approx(35 / 12 / 60)
 
 
-def test_what_the_agent_does_not_read_is_exact(film_of):
+def test_maps_that_the_agent_does_not_read_are_exact(film_of):
     film, last = film_of("representations=[seg]"), []
     frames, _ = film.drive(
         {"episode_seed": 3}, lambda tensordict: last.append(tensordict["sensor"][0].clone())
@@ -68,7 +68,7 @@ def test_what_the_agent_does_not_read_is_exact(film_of):
     assert maps["ego"].abs().max() > 0.1
 
 
-def test_what_the_agent_reads_is_drawn_in_its_units_and_as_noisy_as_it_is(film_of):
+def test_maps_that_the_agent_reads_are_in_units_and_keep_their_noise(film_of):
     options = "representations.obj.scale=0.2", "representations.ego.scale=12.0"
     noise = "noise=depth_camera", "noise.depth_dropout=0.2"
     film, seen = film_of("representations=[ego,obj,depth]", *options, *noise), []
@@ -86,7 +86,7 @@ def test_what_the_agent_reads_is_drawn_in_its_units_and_as_noisy_as_it_is(film_o
 
 
 @pytest.mark.slow
-def test_a_film_leaves_the_agents_estimates_as_they_are(film_of):
+def test_filming_does_not_change_what_the_agent_estimates(film_of):
     """The maps beside them must not change how they are estimated."""
     pytest.importorskip("cv2", reason="flow is estimated by OpenCV")
     overrides = "representations=[raw]", "flow=estimated_fast"
@@ -108,7 +108,7 @@ def test_a_film_leaves_the_agents_estimates_as_they_are(film_of):
         ("obj", "estimated", (160, 192)),  # flow is estimated from pictures of four times the size
     ],
 )
-def test_the_picture_is_large_unless_something_else_reads_it(film_of, representation, flow, rgb):
+def test_the_picture_is_as_large_as_a_tile_unless_it_is_read(film_of, representation, flow, rgb):
     film = film_of(f"representations=[{representation}]", f"flow={flow}")
     assert film.env.observation_spec["sensor", "rgb"].shape == (1, 3, *rgb)
 
@@ -119,7 +119,7 @@ def columns_of(picture, colour):
     return np.flatnonzero(is_it[:200].mean(axis=0) > 0.95)
 
 
-def test_what_the_agent_reads_is_framed_and_a_baseline_reads_nothing(film_of):
+def test_maps_that_the_agent_reads_have_a_frame_and_a_baseline_reads_none(film_of):
     film = film_of("representations=[ego]")
     frames, _ = film.drive({"episode_seed": 3})
     picture = film.draw(frames[0])
@@ -149,7 +149,7 @@ def test_the_last_picture_shows_the_outcome_in_its_colour(film_of):
     assert (pictures[-1][:-28] == bare[:-28]).all()
 
 
-def test_frames_of_a_stack_have_a_tile_each(film_of):
+def test_each_frame_of_a_stack_has_a_tile(film_of):
     film = film_of("representations=[depth2,seg2]", "representations.seg2.encoding=onehot")
     frames, _ = film.drive({"episode_seed": 3})
     assert film.framed == ["depth2, 1 of 2", "depth2, 2 of 2", "seg2, 1 of 2", "seg2, 2 of 2"]
@@ -173,7 +173,7 @@ class Nearness(Depth):
         return (Bounded(0.0, 1.0, shape=shape, device=depth.device, dtype=torch.float32),)
 
 
-def test_a_representation_of_ones_own_is_shown_in_grey():
+def test_a_representation_of_a_user_is_drawn_in_grey():
     config = composed("debug=smoke", "device=cpu")
     own = {"near": {"_target_": f"{__name__}.Nearness", "range_m": 50.0}}
     agent = Agent(leave_the_road, config.model_copy(update={"representations": own}))

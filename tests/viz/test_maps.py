@@ -27,11 +27,11 @@ def flow_of(u: float, v: float) -> np.ndarray:
         (400.0, 0.0, (255, 0, 0)),  # beyond the scale: full, not wrapped
     ],
 )
-def test_flow_colour_by_hand(u, v, rgb):
+def test_the_colours_of_flow_are_those_worked_by_hand(u, v, rgb):
     assert np.abs(viz.flow_to_rgb(flow_of(u, v), scale_px=4.0)[0, 0].astype(int) - rgb).max() <= 1
 
 
-def test_flow_colour_is_the_hsv_wheel():
+def test_the_colours_of_flow_are_those_of_the_hsv_wheel():
     u, v = 1.5, 2.0  # magnitude 2.5, an angle within no axis
     hue = np.arctan2(v, u) / (2 * np.pi)
     expected = 255 * np.array(colorsys.hsv_to_rgb(hue, np.sqrt(2.5 / 10), 1.0))
@@ -50,7 +50,7 @@ def test_flow_that_is_not_finite_is_grey(bad):
     assert viz.flow_to_rgb(flow_of(0.0, bad), scale_px=1.0)[0, 0].tolist() == [128, 128, 128]
 
 
-def test_flow_wheel_is_its_own_legend():
+def test_the_flow_wheel_has_the_colours_of_flow():
     wheel = viz.flow_wheel(101)
     assert wheel[50, 50].tolist() == [255, 255, 255]
     assert wheel[50, 0].tolist() == [0, 255, 255]  # left rim: flow to the left
@@ -67,18 +67,13 @@ def test_classes_have_a_colour_each_in_the_order_of_their_ids():
     assert len(set(CLASS_COLOURS.values())) == len(CLASS_COLOURS)
 
 
-def test_classes_take_their_colour_from_the_one_table():
-    image = viz.classes_to_rgb(torch.tensor([[[0, 4, 10, 200]]], dtype=torch.uint8))
+def test_classes_have_the_colours_of_the_table_and_unknown_ids_are_grey():
+    image = viz.classes_to_rgb(torch.tensor([[[0, 4, 10, 11, 255, 256, -1]]]))
     colours = [CLASS_COLOURS[name] for name in ("sky", "pedestrian", "traffic_light")]
-    assert [tuple(pixel) for pixel in image[0].tolist()] == [*colours, (128, 128, 128)]
+    assert [tuple(pixel) for pixel in image[0].tolist()] == [*colours, *[(128, 128, 128)] * 4]
 
 
-def test_ids_beyond_those_of_a_byte_are_unknown_too():
-    image = viz.classes_to_rgb(torch.tensor([[[-2, -1, 255, 256, 260]]]))
-    assert (image == 128).all()
-
-
-def test_depth_gets_darker_and_ends_in_black_where_nothing_is():
+def test_depth_gets_darker_with_distance_and_is_black_where_nothing_is():
     depth = np.array([[[0.0, 1.0, 9.0, 99.0, 150.0, np.inf, np.nan]]], dtype=np.float32)
     near, *rest, far, further, sky, missing = viz.depth_to_rgb(depth, range_m=99.0)[0].astype(int)
     assert near.tolist() == [252, 253, 191]
@@ -113,7 +108,7 @@ def test_strip_draws_what_is_there_in_a_fixed_order_enlarged_without_blur():
 
 
 @pytest.mark.parametrize("factor", [2, 6])  # an estimator's pictures; as large as the tiles
-def test_a_picture_larger_than_the_maps_is_as_large_as_they_in_a_strip(factor):
+def test_a_picture_larger_than_the_maps_has_their_size_in_a_strip(factor):
     given = maps()
     rgb = torch.zeros(3, 30 * factor, 40 * factor, dtype=torch.uint8)
     rgb[:, :, 20 * factor :] = 9
@@ -123,7 +118,7 @@ def test_a_picture_larger_than_the_maps_is_as_large_as_they_in_a_strip(factor):
     assert (image[48:, 120:240] == 9).all()
 
 
-def test_labels_are_written_and_the_wheel_stands_beside_flow_only():
+def test_every_map_has_a_label_and_only_flow_has_a_wheel():
     image = viz.representation_strip(maps())
     rgb_bar, obj_bar = image[:28, :240], image[:28, 488:]
     assert (rgb_bar < 128).any()
@@ -132,7 +127,7 @@ def test_labels_are_written_and_the_wheel_stands_beside_flow_only():
     assert (obj_bar[:, -28:].min(-1) != obj_bar[:, -28:].max(-1)).any()
 
 
-def test_a_strip_explains_its_classes():
+def test_a_strip_explains_the_colours_of_the_classes_that_are_named():
     classes, given = ("road", "pedestrian", "traffic_light"), maps(30, 20)
     bare = viz.representation_strip(given)
     told = viz.representation_strip(given, categories=classes)
@@ -143,7 +138,7 @@ def test_a_strip_explains_its_classes():
     assert len(narrow) == len(bare) + 3 * 20  # a row for each
 
 
-def test_a_frame_is_around_the_named_maps_alone():
+def test_only_the_named_maps_have_a_frame():
     given = maps(30, 20)
     bare, framed = viz.representation_strip(given), viz.representation_strip(given, framed=["obj"])
     # each of three tiles is 10 px larger, so that they stand at one height
@@ -153,7 +148,7 @@ def test_a_frame_is_around_the_named_maps_alone():
     assert not orange[:, :-170].any()
 
 
-def test_a_name_is_a_list_of_one_and_not_of_its_letters():
+def test_a_single_name_works_like_a_list_of_one():
     shown = {"raw": np.zeros((20, 30, 3), np.uint8), "aw": np.zeros((20, 30, 3), np.uint8)}
     for option in ("wheel_for", "framed"):
         image = viz.strip(shown, **{option: "raw"})
@@ -162,17 +157,18 @@ def test_a_name_is_a_list_of_one_and_not_of_its_letters():
     np.testing.assert_array_equal(one, listed)
 
 
-def test_a_map_in_grey_is_black_at_its_least_and_white_at_its_most():
+def test_a_grey_map_is_black_at_its_low_end_and_white_at_its_high_end():
     values = np.array([[[-3.0, -1.0, 0.0, 3.0, 9.0, np.nan]]])
     # 0 is a quarter of the way from -1 to 3
     grey = viz.grey_to_rgb(values, -1.0, 3.0)[0]
     assert grey[:5].tolist() == [[v, v, v] for v in (0, 0, 64, 255, 255)]
 
 
-def test_the_given_scale_is_that_of_the_colours():
-    given = {"obj": torch.full((2, 3, 40), 2.0)}
-    image = viz.representation_strip(given, flow_scale_px={"obj": 8.0})
-    assert (image[48:] == viz.flow_to_rgb(given["obj"], 8.0)[0, 0]).all()
+def test_a_scale_of_one_flow_changes_its_colours_alone():
+    flow = torch.full((2, 3, 40), 2.0)
+    image = viz.representation_strip({"obj": flow, "ego": flow}, flow_scale_px={"obj": 8.0})
+    assert (image[48:, 244:] == viz.flow_to_rgb(flow, 8.0)[0, 0]).all()
+    assert (image[48:, :240] == viz.flow_to_rgb(flow, 20.0)[0, 0]).all()  # the others keep theirs
 
 
 def test_the_bar_of_depth_has_the_colours_of_depth_from_near_to_far():
@@ -197,7 +193,7 @@ def test_the_bar_of_depth_has_the_colours_of_depth_from_near_to_far():
         (lambda: viz.strip({"a": np.zeros((2, 3, 3)), "b": np.zeros((3, 2, 3))}), "needs images"),
     ],
 )
-def test_mistakes_are_named(call, message):
+def test_maps_that_cannot_be_drawn_are_refused_with_the_reason(call, message):
     with pytest.raises(ValueError, match=message):
         call()
 
@@ -226,9 +222,3 @@ def test_importing_viz_needs_numpy_alone():
     code = f"import sys, flowrep.viz; print({others} & sys.modules.keys())"
     found = run_python("-c", code, check=True)
     assert found.stdout.strip() == "set()"
-
-
-def test_one_flow_s_scale_leaves_the_others():
-    maps = {name: np.zeros((2, 24, 32)) for name in ("raw", "ego", "obj")}
-    changed = viz.representation_strip(maps, flow_scale_px={"obj": 2.0})
-    assert changed.shape == viz.representation_strip(maps).shape

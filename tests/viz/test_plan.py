@@ -23,7 +23,7 @@ def labels(figure):
     return [text.get_text() for text in figure.legends[0].get_texts()]
 
 
-def test_every_way_to_end_has_a_colour_of_its_own():
+def test_every_outcome_has_another_colour():
     assert list(OUTCOME_COLOURS) == [outcome.label for outcome in Outcome if outcome]
     assert len(set(OUTCOME_COLOURS.values())) == len(OUTCOME_COLOURS)
 
@@ -44,7 +44,7 @@ def test_a_track_is_drawn_in_its_outcomes_colour_where_it_was_driven(layout):
     assert "x (m)" in axes.get_xlabel()
 
 
-def test_the_legend_names_what_the_scene_has(layout):
+def test_the_legend_names_only_what_the_scene_has(layout):
     names = labels(draw_plan(layout))
     for name in ("road", "crosswalk", "terrain", "tree", "fence", "car", "traffic light"):
         assert name in names
@@ -63,7 +63,7 @@ def test_nothing_that_stands_is_cut_off(layout):
         assert y0 < lower < upper < y1
 
 
-def test_every_zone_of_a_path_is_named_where_it_is(layout):
+def test_every_zone_of_a_path_has_its_name_at_its_place(layout):
     (axes,) = draw_plan(layout).axes
     named = {text.get_text(): text.xy for text in axes.texts if text.get_text()}
     assert set(named) == {"entry", "left end", "right end"}
@@ -73,7 +73,7 @@ def test_every_zone_of_a_path_is_named_where_it_is(layout):
         assert layout.zones[name.replace(" ", "_")].contains(Point(place))
 
 
-def test_where_a_place_is_start_and_end_both_names_can_be_read():
+def test_a_zone_that_is_start_and_end_has_its_names_on_two_sides():
     (axes,) = draw_plan(Layout(load_scene("s_turn"))).axes
     offsets = {t.get_text(): t.xyann for t in axes.texts if t.get_text()}
     # The western stretch runs along x: its start is named above it, its end below.
@@ -81,7 +81,7 @@ def test_where_a_place_is_start_and_end_both_names_can_be_read():
     assert offsets["west end"] == pytest.approx((0, -30), abs=1e-6)
 
 
-def test_a_path_shows_its_own_closures_alone(layout):
+def test_a_plan_of_a_path_shows_only_the_closures_of_that_path(layout):
     def closed(path):
         patches = draw_plan(layout, path=path).axes[0].patches
         dark = [patch for patch in patches if to_hex(patch.get_facecolor()) == "#303030"]

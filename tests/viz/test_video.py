@@ -58,7 +58,7 @@ def test_a_full_disk_ends_in_one_line_and_leaves_the_old_film(tmp_path, frames):
     assert [file.name for file in tmp_path.iterdir()] == ["episode.mp4"]
 
 
-def test_an_interrupted_film_is_not_there(tmp_path):
+def test_an_interrupted_film_leaves_no_file(tmp_path):
     def interrupted():
         yield from noise(2)
         raise KeyboardInterrupt
@@ -68,7 +68,7 @@ def test_an_interrupted_film_is_not_there(tmp_path):
     assert not [*tmp_path.iterdir()]
 
 
-def test_without_frames_there_is_no_file(tmp_path):
+def test_a_film_without_frames_is_an_error_and_leaves_no_file(tmp_path):
     with pytest.raises(OSError, match=r"episode\.mp4"):
         viz.write_video(tmp_path / "episode.mp4", [], fps=12)
     assert not [*tmp_path.iterdir()]
@@ -88,6 +88,6 @@ def test_a_broken_or_missing_film_is_not_playable(tmp_path):
 @pytest.mark.parametrize(
     "frame", [np.full((32, 32, 3), 0.5), np.zeros((32, 32, 4), np.uint8)], ids=["float", "alpha"]
 )
-def test_what_is_no_picture_is_refused(tmp_path, frame):
+def test_a_frame_that_is_no_rgb_picture_is_refused(tmp_path, frame):
     with pytest.raises(ValueError, match=r"\[H, W, 3\] uint8"):
         viz.write_video(tmp_path / "film.mp4", [frame], fps=4)
