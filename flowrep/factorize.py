@@ -141,7 +141,8 @@ def factorize_recording(config: FactorizeConfig) -> int:
 
 def open_stream(config: FactorizeConfig) -> sequences.Stream:
     """Returns the recording or camera that `input` and `format` name."""
-    from flowrep.sequences.declared import READERS, DeclaredRecording
+    from flowrep.sequences.declared import DeclaredRecording
+    from flowrep.sequences.formats import READERS
 
     name, options = config.format.target.rpartition(".")[2], config.format.options()
     if name not in READERS:

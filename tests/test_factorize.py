@@ -26,7 +26,7 @@ from flowrep.config.usage import UsageError
 from flowrep.factorize import FactorizeConfig, factorize_recording, main, open_stream
 from flowrep.files import read_rows
 from flowrep.sequences import Frame, SequenceError, open_recording, read_flow, recorded_motion
-from flowrep.sequences.declared import declaration
+from flowrep.sequences.formats import declaration
 from flowrep.sequences.job import Job
 from flowrep.sequences.output import Output
 from tests.config.composing import plain

@@ -56,14 +56,14 @@ class Camera(pydantic.BaseModel):
 _COLMAP = {
     "SIMPLE_PINHOLE": "f cx cy", "PINHOLE": "fx fy cx cy", "SIMPLE_RADIAL": "f cx cy k1",
     "RADIAL": "f cx cy k1 k2", "OPENCV": "fx fy cx cy k1 k2 p1 p2",
-    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
-    "RADIAL_FISHEYE": "f cx cy k1 k2", "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", "SIMPLE_RADIALFISHEYE": "f cx cy k1",
+    "RADIALFISHEYE": "f cx cy k1 k2", "OPENCVFISHEYE": "fx fy cx cy k1 k2 k3 k4",
 }  # fmt: skip
 # The names of the same numbers in files of ROS, OpenCV, Open3D and NeRF tools.
 _WIDTH, _HEIGHT = ("width", "image_width", "w"), ("height", "image_height", "h")
 _MATRIX = ("camera_matrix", "cameraMatrix", "intrinsic_matrix", "K", "k")
 _LENS = ("distortion_coefficients", "distortionCoefficients", "dist_coeffs", "D", "d")
-_FISHEYE = ("equidistant", "fisheye", "OPENCV_FISHEYE")
+FISHEYE = ("equidistant", "fisheye", "OPENCVFISHEYE")
 FILES = (".json", ".yaml", ".yml", "cameras.txt")
 
 
@@ -108,7 +108,7 @@ def _colmap(path: Path) -> dict[str, Any]:
             path, f"has the lens {model}; of COLMAP's, read are {', '.join(_COLMAP)}"
         )
     named = dict(zip(_COLMAP[model].split(), map(float, numbers), strict=True))
-    lens = "OPENCV_FISHEYE" if model.endswith("FISHEYE") else "OPENCV"
+    lens = "OPENCVFISHEYE" if model.endswith("FISHEYE") else "OPENCV"
     return {"w": int(width), "h": int(height), "fl_x": named.get("f"), "camera_model": lens} | named
 
 
@@ -130,7 +130,7 @@ def _renamed(given: dict[str, Any]) -> dict[str, Any]:
         centre = given.get("cx", width / 2), given.get("cy", height / 2)
         numbers = [fx, of(("fl_y", "fy")) or fx, *centre]
         order = ["k1", "k2", "k3", "k4"]
-        if given.get("camera_model") not in _FISHEYE:
+        if given.get("camera_model") not in FISHEYE:
             order = ["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"][: 8 if "k4" in given else 5]
         coefficients = [given.get(name, 0.0) for name in order]
     else:
@@ -139,7 +139,7 @@ def _renamed(given: dict[str, Any]) -> dict[str, Any]:
     if any(coefficients):
         model = {given.get("distortion_model"), given.get("camera_model")}
         camera |= {"distortion": list(map(float, coefficients))}
-        camera |= {"lens": "fisheye" if model & {*_FISHEYE} else "opencv"}
+        camera |= {"lens": "fisheye" if model & {*FISHEYE} else "opencv"}
     return camera
 
 

@@ -200,7 +200,7 @@ def read_array(path: Path) -> NDArray[Any]:
         elif suffix in _HDF5:
             array = _read_hdf5(path)
         else:
-            array = _decoded(path, regular(path).read_bytes())
+            array = decoded(path, regular(path).read_bytes())
     except (ValueError, EOFError, RuntimeError, struct.error, cv2.error, _Bomb) as error:
         raise SequenceError(path, f"can't be read as {suffix}: {error}") from None
     if array is None:
@@ -208,7 +208,8 @@ def read_array(path: Path) -> NDArray[Any]:
     return array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
 
 
-def _decoded(path: Path, data: bytes) -> NDArray[Any] | None:
+def decoded(path: Path, data: bytes) -> NDArray[Any] | None:
+    """Returns the picture in a file's bytes, red first; None if there is none, or only a part."""
     # Before version 5, OpenCV silently fills a truncated picture with grey, so look for the end
     # marker. Some cameras write a few bytes after it.
     end = {b"\x89P": b"IEND", b"\xff\xd8": b"\xff\xd9"}.get(data[:2], b"")

@@ -1,0 +1,47 @@
+"""The formats of conf/format/ by name, and their readers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from flowrep.config import CONF_DIR, group_choices
+from flowrep.config.options import check_reader_options
+from flowrep.config.usage import closest_first
+from flowrep.sequences.declared import DeclaredRecording
+from flowrep.sequences.kitti import Kitti
+from flowrep.sequences.recording import Recording, SequenceError
+from flowrep.sequences.rosbag import RosBag
+from flowrep.sequences.video import StillVideo
+
+READERS: dict[str, Any] = {
+    reader.__name__: reader for reader in (DeclaredRecording, Kitti, RosBag, StillVideo)
+}
+
+
+def declaration(format_name: str) -> dict[str, Any]:
+    """Returns the keys of `conf/format/<name>.yaml` and of the formats from which it starts."""
+    plain: Any = OmegaConf.to_container(OmegaConf.load(CONF_DIR / f"format/{format_name}.yaml"))
+    keys: dict[str, Any] = {}
+    for base in plain.pop("defaults", []):
+        keys |= {} if base == "_self_" else declaration(base)
+    return keys | plain
+
+
+def open_recording(folder: str | Path, format: str, **options: Any) -> Recording:
+    """Returns the recording in a folder, in a format of `conf/format/` with other options.
+
+    >>> open_recording("rgbd_dataset_freiburg1_desk", "tum", tolerance_s=0.05)  # doctest: +SKIP
+    """
+    if format not in group_choices("format"):
+        there = closest_first(format, group_choices("format"))
+        raise SequenceError(f"format={format}", f"is unknown; there are: {there}")
+    keys = declaration(format) | options
+    reader = READERS[keys.pop("_target_").rpartition(".")[2]]
+    check_reader_options(reader, keys)
+    recording: Recording = reader(folder, **keys)
+    if isinstance(recording, DeclaredRecording):
+        recording.check_files(options)
+    return recording
