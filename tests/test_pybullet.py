@@ -119,7 +119,7 @@ def test_where_nothing_was_drawn_depth_is_inf_though_the_buffer_is_not_1(world):
         assert (seen["instance"][0, :20] == 0).all()
 
 
-def test_pictures_and_classes(world):
+def test_rgb_and_semantic_maps_show_the_bodies(world):
     crate = box(world, [0, 0, 0.06])
     options = {"fov_deg": 60, "view": VIEW}
     plain = BulletCamera(world, 60, 40, **options)
@@ -254,7 +254,7 @@ def check_drive(client, camera, views, steps):
     assert moved > 3
 
 
-def test_links_and_a_moving_camera_in_pictures(world):
+def test_flow_of_links_and_a_moving_camera_agrees_with_the_pictures(world):
     robot = world.loadURDF("kuka_iiwa/model.urdf", useFixedBase=True)
     crate = box(world, [0.5, 0.3, 0.4], mass=1.0)
     world.resetBaseVelocity(crate, [-0.5, 0, 1], [0, 3, 5])
@@ -274,7 +274,7 @@ def test_links_and_a_moving_camera_in_pictures(world):
     check_drive(world, camera, [lambda t=t: view(t) for t in range(10)], [step] * 10)
 
 
-def test_a_camera_on_a_link_in_pictures(world):
+def test_flow_of_a_camera_on_a_link_agrees_with_the_pictures(world):
     robot = world.loadURDF("kuka_iiwa/model.urdf", useFixedBase=True)
     box(world, [0.5, 0.1, 0.06])
     world.resetJointState(robot, 3, -1.5)
@@ -317,7 +317,7 @@ def test_a_link_s_axes_are_those_of_the_urdf_with_z_ahead(world):
     np.testing.assert_allclose(depth, 3.0, atol=1e-4)
 
 
-def test_bodies_that_appear_and_vanish_in_pictures(world):
+def test_flow_of_bodies_that_appear_and_vanish_agrees_with_the_pictures(world):
     bodies = [box(world, [0.3, 0.2, 0.1]), box(world, [0.0, -0.3, 0.2])]
     times = iter(range(10))
 
@@ -336,7 +336,7 @@ def test_bodies_that_appear_and_vanish_in_pictures(world):
     check_drive(world, camera, [lambda: VIEW] * 10, [step] * 10)
 
 
-def test_what_stands_has_exactly_no_object_flow_before_a_moving_camera(world):
+def test_bodies_at_rest_have_exactly_no_object_flow_before_a_moving_camera(world):
     robot = world.loadURDF("kuka_iiwa/model.urdf", useFixedBase=True)
     box(world, [0.5, 0.3, 0.1])
     camera = BulletCamera(world, WIDTH, HEIGHT, fov_deg=60)
@@ -354,7 +354,7 @@ def test_what_stands_has_exactly_no_object_flow_before_a_moving_camera(world):
     assert (td["obj"].norm(dim=0)[hand[0]] > 0).float().mean() > 0.9
 
 
-def test_at_a_reset_nothing_has_moved(world):
+def test_at_a_reset_motions_are_the_identity(world):
     crate = box(world, [0.3, 0.2, 0.1])
     camera = BulletCamera(world, 60, 40, fov_deg=60)
     camera.reset(VIEW)
@@ -368,7 +368,7 @@ def test_at_a_reset_nothing_has_moved(world):
 # Which body is which
 
 
-def test_the_motion_of_a_body_that_was_not_there_is_unknown_for_one_step(world):
+def test_the_motion_of_a_new_body_is_unknown_for_one_step(world):
     camera = BulletCamera(world, 60, 40, fov_deg=60, view=VIEW)
     camera.reset()
     crate = box(world, [0.1, 0, 0.3])
@@ -385,7 +385,7 @@ def test_the_motion_of_a_body_that_was_not_there_is_unknown_for_one_step(world):
     assert abs(raw[1, here]).min() > 1
 
 
-def test_a_body_that_gets_the_number_of_another_is_not_the_other(world):
+def test_a_body_with_the_number_of_a_removed_one_gets_another_row(world):
     crate = box(world, [0.1, 0, 0.3])
     camera = BulletCamera(world, 60, 40, fov_deg=60, view=VIEW)
     camera.reset()
@@ -398,7 +398,7 @@ def test_a_body_that_gets_the_number_of_another_is_not_the_other(world):
     assert np.isfinite(seen["instance_motion"][row]).all()
 
 
-def test_rows_of_bodies_that_left_are_used_again_and_too_few_are_named(world):
+def test_rows_of_removed_bodies_are_reused_and_too_few_rows_are_refused(world):
     camera = BulletCamera(world, 60, 40, fov_deg=60, view=VIEW, max_instances=3)
     crates = [box(world, [0, 0, 0.3]), box(world, [0, 0.3, 0.3])]
     assert camera.reset()["instance_motion"].shape == (4, 4, 4)
@@ -507,7 +507,7 @@ def test_the_flow_of_soft_bodies_is_unknown(world):
         ({"fov_deg": 60, "link": (7, -1)}, "body 7"),
     ],
 )
-def test_mistakes_are_named(world, options, names):
+def test_invalid_arguments_are_refused_by_name(world, options, names):
     with pytest.raises(ValueError, match=names):
         BulletCamera(world, 60, 40, **{"view": VIEW, **options}).reset()
 
@@ -559,7 +559,7 @@ def hand_view(env):
 
 @pytest.mark.slow_after_first
 @pytest.mark.parametrize("name", ENVS)
-def test_the_envs_of_others_in_pictures(name):
+def test_flow_in_others_envs_agrees_with_the_pictures(name):
     make, camera, _ = ENVS[name]
     env = BulletFlow(make(), camera)
     env.action_space.seed(0)
@@ -583,7 +583,7 @@ def test_the_envs_of_others_in_pictures(name):
 
 @pytest.mark.slow_after_first
 @pytest.mark.parametrize("name", ENVS)
-def test_an_env_runs_as_if_nobody_looked(name):
+def test_a_camera_does_not_change_the_env(name):
     make, camera, _ = ENVS[name]
 
     def drive(env):

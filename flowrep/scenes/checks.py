@@ -21,6 +21,7 @@ from flowrep.scenes.scene import (
     PedestrianGroup,
     Scene,
     SceneError,
+    check_speed,
 )
 
 MOST_BOXES = 2_000
@@ -33,6 +34,13 @@ def check_references(scene: Scene) -> None:
     most = 255 // len(pedestrians.PARTS)  # instance ids have 8 bits, and 0 is the static world
     if scene.num_pedestrians > most:
         raise SceneError(f"pedestrian_groups: {scene.num_pedestrians} people; give {most} or fewer")
+    speeds_mps = {"vehicle.speed_mps": scene.vehicle.speed_mps}
+    for mode, (_, highest) in scene.pedestrian_speed_mps.items():
+        speeds_mps[f"pedestrian_speed_mps.{mode}"] = highest
+    for group in scene.pedestrian_groups:
+        speeds_mps[f"pedestrian_groups.{group.name}.speed_mps"] = (group.speed_mps or (0, 0))[1]
+    for key, speed_mps in speeds_mps.items():
+        check_speed(key, speed_mps, scene.camera, scene.frame_rate_hz)
     _check_known("categories", scene.categories, CATEGORY_ID)
     for key, names in _categories_used(scene).items():
         _check_known(key, names, scene.categories)

@@ -148,6 +148,16 @@ class CameraConfig(Part):
         return np.array([[self.focal_px, 0.0, cx_px], [0.0, self.focal_px, cy_px], [0.0, 0.0, 1.0]])
 
 
+def check_speed(key: str, speed_mps: float, camera: CameraConfig, frame_rate_hz: float) -> None:
+    """Raises SceneError if a step leads farther than the camera sees."""
+    # Two frames would have nothing in common, and the footprint is tested all along a step.
+    if speed_mps > (most_mps := camera.far_m * frame_rate_hz):
+        raise SceneError(
+            f"{key}: is {speed_mps:g} m/s, {speed_mps / frame_rate_hz:g} m in a step, but the "
+            f"camera sees {camera.far_m:g} m; give {most_mps:g} m/s or less"
+        )
+
+
 @dataclass(frozen=True)
 class VehicleConfig(Part):
     """Size, speed and turning of the vehicle."""

@@ -28,7 +28,7 @@ def test_the_planner_arrives_and_habit_and_chance_seldom_do(drive, speed):
     assert by_chance.count("success") <= 6
 
 
-def test_the_planner_plans_anew_where_it_is_led_astray(make_street, empty_road):
+def test_the_planner_replans_after_other_actions(make_street, empty_road):
     env = make_street(empty_road, sensors=())
     planner = Planner()
     env.reset(seed=0)
@@ -40,7 +40,7 @@ def test_the_planner_plans_anew_where_it_is_led_astray(make_street, empty_road):
     assert env.episode.outcome.label == "success"
 
 
-def test_a_planner_blind_to_speed_plans_the_same_whatever_the_speed(make_street):
+def test_the_speed_blind_planners_plan_does_not_depend_on_speed(make_street):
     plans = {True: [], False: []}
     for sees_speed, speed_mps in product(plans, ((0.5, 0.5), (2.5, 2.5))):
         env = make_street(speed=speed_mps, sensors=())
@@ -51,7 +51,7 @@ def test_a_planner_blind_to_speed_plans_the_same_whatever_the_speed(make_street)
     assert plans[True][0] != plans[True][1]
 
 
-def test_the_way_to_go_leads_round_corners():
+def test_the_goal_distance_leads_round_corners():
     # An L: 10 m along x, then 10 m along y, 2 m wide; the goal is its upper end.
     corner = shapely.union(shapely.box(0, 0, 10, 2), shapely.box(8, 0, 10, 10))
     way = GoalDistance(corner, shapely.box(8, 9, 10, 10))

@@ -142,7 +142,7 @@ def test_a_closed_exit_ends_the_drive_into_it(make_street, name, driven, path, c
         ("north_to_south", -65.0 + 121.0 - 152 * 10 / 24),
     ],
 )
-def test_straight_on_in_the_h_stands_a_house(make_street, path, y_m):
+def test_driving_straight_on_in_the_h_ends_at_a_house(make_street, path, y_m):
     env = make_street(replace(load_scene("h_shaped_pathways"), pedestrian_groups=()), sensors=())
     assert driven_to_its_end(env, repeat(0), path=path) == ("collision", "building")
     assert env.episode.now.vehicle[:2] == pytest.approx((0.0, y_m), abs=1e-6)

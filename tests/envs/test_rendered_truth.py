@@ -109,7 +109,7 @@ def test_each_pixel_is_found_where_its_flow_says_it_was(drive, name):
 
 
 @pytest.mark.slow
-def test_without_the_peoples_own_motion_people_are_not_found(drive):
+def test_pixels_of_people_need_the_motion_of_people(drive):
     def without_own_motion(frame):
         rows = frame["prev_from_curr"].expand_as(frame["instance_motion"])
         return frame | {"instance_motion": rows}
@@ -126,7 +126,7 @@ def flows(frame):
     return raw, factors.ego, factors.obj
 
 
-def test_a_camera_that_stands_has_no_ego_flow(drive):
+def test_a_still_camera_has_no_ego_flow(drive):
     moved = False
     for frame in drive([NO_OP] * 10, vehicle_speed_mps=0.0):
         raw, ego, obj = flows(frame)
@@ -137,7 +137,7 @@ def test_a_camera_that_stands_has_no_ego_flow(drive):
     assert moved
 
 
-def test_people_who_stand_have_no_object_flow(drive):
+def test_standing_people_have_no_object_flow(drive):
     moved, seen = False, 0
     for frame in drive(ACTIONS[:20], speed=(0.0, 0.0)):
         raw, _, obj = flows(frame)
@@ -148,7 +148,7 @@ def test_people_who_stand_have_no_object_flow(drive):
     assert seen > 100
 
 
-def test_at_reset_nothing_has_moved(drive):
+def test_motions_are_the_identity_at_reset(drive):
     frame = next(drive([]))
     assert torch.equal(frame["prev_from_curr"], torch.eye(4))
     assert torch.equal(frame["instance_motion"], torch.eye(4).expand_as(frame["instance_motion"]))

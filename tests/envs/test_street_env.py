@@ -30,7 +30,7 @@ def same(a, b):
     return a.keys() == b.keys() and all(np.array_equal(a[key], b[key]) for key in a)
 
 
-def test_the_observation_has_what_was_asked_for(make_street, straight_road):
+def test_the_observation_has_the_requested_sensors(make_street, straight_road):
     camera = replace(straight_road.camera, height_px=20, width_px=30)
     parts = 3 * straight_road.num_pedestrians
     asked = {
@@ -50,7 +50,7 @@ def test_the_observation_has_what_was_asked_for(make_street, straight_road):
     assert [*make_street(straight_road, sensors="depth").observation_space] == ["depth"]
 
 
-def test_a_frame_is_named_by_its_episode_and_step(make_street):
+def test_the_frame_sensor_is_the_episode_seed_and_the_step(make_street):
     env = make_street(sensors=("frame",))
     observation, _ = env.reset(options={"episode_seed": 41})
     assert observation["frame"].tolist() == [41, 0]
@@ -156,7 +156,7 @@ def test_no_speed_lets_the_vehicle_pass_through_a_fence_or_a_person(
         (12.0, 2.4, 10.0, 0.1, 9),
     ],
 )
-def test_looks_are_as_many_as_the_fastest_asks_for(
+def test_the_fastest_body_determines_the_number_of_ticks(
     straight_road, rate_hz, walking_mps, driving_mps, length_m, ticks
 ):
     scene = replace(straight_road, vehicle=replace(straight_road.vehicle, length_m=length_m))
@@ -186,7 +186,7 @@ def test_a_parked_car_is_hit_as_a_car(make_street, empty_road):
     assert len(rewards) == 45
 
 
-def test_low_and_high_speed_change_the_people_alone(make_street, straight_road):
+def test_the_speed_mode_changes_nothing_but_peoples_speed(make_street, straight_road):
     def travelled(speed):
         env = make_street(speed=speed, sensors=())
         env.reset(seed=3)
@@ -212,7 +212,7 @@ def test_a_group_walks_at_one_speed_in_one_direction(make_street):
     assert len(np.unique(pace[:, 0].round(6))) == len(pace)
 
 
-def test_what_is_rendered_changes_nothing_else(make_street):
+def test_rendering_does_not_change_the_episode(make_street):
     seeing, blind = make_street(), make_street(sensors=())
     for env in (seeing, blind):
         env.reset(seed=5)
@@ -221,7 +221,7 @@ def test_what_is_rendered_changes_nothing_else(make_street):
         assert seeing.get_state() == blind.get_state()
 
 
-def test_an_episode_may_have_a_speed_and_a_frame_rate_of_its_own(make_street):
+def test_reset_options_set_speed_and_frame_rate_of_one_episode(make_street):
     """On one street all is as on a street made for them, and its own come back afterwards."""
     shared, made_for = make_street(), make_street(speed="high", frame_rate_hz=7.0)
     for env, options in ((shared, {"speed": "high", "frame_rate_hz": 7.0}), (made_for, {})):
@@ -247,7 +247,7 @@ def test_an_episode_may_have_a_speed_and_a_frame_rate_of_its_own(make_street):
         ({"speed": (2.0, 1.0)}, r"speed is \(2.0, 1.0\)"),
         ({"speed": (1.0,)}, r"speed is \(1.0,\)"),
         ({"speed": None}, "speed is None"),
-        ({"speed": (1.0, 1e8)}, r"speed is 1e\+08 m/s"),
+        ({"speed": (1.0, 1e8)}, r"speed: is 1e\+08 m/s"),
         ({"speed": ("1", "2")}, r"speed is \('1', '2'\)"),
         ({"frame_rate_hz": 0}, r"frame_rate_hz is 0;"),
         ({"frame_rate_hz": "12"}, r"frame_rate_hz is '12'"),
@@ -259,12 +259,12 @@ def test_an_episode_may_have_a_speed_and_a_frame_rate_of_its_own(make_street):
         ({"render_mode": "human"}, "render_mode is 'human'.*HumanRendering"),
     ],
 )
-def test_arguments_that_cannot_be_are_refused(arguments, message):
+def test_invalid_arguments_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         StreetEnv(**arguments)
 
 
-def test_calls_out_of_turn_say_what_to_call(make_street, one_stands):
+def test_a_step_without_a_running_episode_says_to_call_reset(make_street, one_stands):
     env = make_street(one_stands, sensors=())
     with pytest.raises(RuntimeError, match="call reset"):
         env.step(NO_OP)
@@ -273,7 +273,7 @@ def test_calls_out_of_turn_say_what_to_call(make_street, one_stands):
         env.step(NO_OP)
 
 
-def test_reset_options_that_cannot_be_are_refused(make_street, empty_road):
+def test_invalid_reset_options_are_refused(make_street, empty_road):
     env = make_street(empty_road, sensors=())
     for option, value, message in (
         ("start", 3, r"unknown reset options \['start'\]"),
@@ -290,7 +290,7 @@ def test_reset_options_that_cannot_be_are_refused(make_street, empty_road):
         ("state", 5, "get_state"),
         ("state", {"steps": 3}, "get_state: outcome"),
         # A step of a twelfth of a second would lead past all that is seen, 300 m.
-        ("vehicle_speed_mps", 1e7, r"vehicle_speed_mps is 1e\+07 m/s.* 3600 m/s"),
+        ("vehicle_speed_mps", 1e7, r"vehicle_speed_mps: is 1e\+07 m/s.* 3600 m/s"),
     ):
         with pytest.raises(ValueError, match=message):
             env.reset(options={option: value})

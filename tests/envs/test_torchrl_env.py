@@ -69,7 +69,7 @@ def play(env, actions, start=None):
     return torch.stack(steps), tensordict
 
 
-def test_marks_that_name_no_street_reset_none_and_no_marks_all(make):
+def test_a_reset_mask_of_false_resets_no_street_and_no_mask_resets_all(make):
     env = make("straight_road", ["ego"], num_envs=2, seed=0)
     first = env.reset()
     stepped = env.step(first.set("action", torch.tensor([1, 2])))["next"]
@@ -103,7 +103,7 @@ def test_a_seed_that_is_no_whole_number_is_refused(seed):
 
 
 @pytest.mark.parametrize("device", ["cuda:93", "gpu", 2.5])
-def test_a_device_that_can_not_be_used_is_named_at_once(device):
+def test_an_unusable_device_is_refused(device):
     with pytest.raises(ValueError, match=rf"^device={device} .*device=cpu$"):
         make_env("straight_road", device=device)
 
@@ -153,7 +153,7 @@ def test_torchrls_own_checks_pass(make, representations, options):
     assert env.batch_size == (2,)
 
 
-def test_what_was_sensed_is_kept_beside_its_noise(make):
+def test_with_keep_sensor_exact_maps_stay_beside_noisy_ones(make):
     env = make(representations=["obj"], noise=NOISE, keep_sensor=True, seed=0)
     sensor = env.reset()["sensor"]
     assert sensor["noisy_depth"].isnan().any()
@@ -174,7 +174,7 @@ def test_the_tensordict_has_the_representations_and_no_sensor(make):
     assert env.action_spec.space.n == 3
 
 
-def test_only_what_is_read_is_rendered(make):
+def test_only_sensors_that_a_transform_reads_are_rendered(make):
     for names, options, sensors in (
         ([], {}, ()),
         (["seg"], {}, ("semantic",)),
@@ -187,7 +187,7 @@ def test_only_what_is_read_is_rendered(make):
         assert street_envs(env)[0].sensing.names == sensors
 
 
-def test_flow_is_compiled_where_that_is_asked_for(make, monkeypatch):
+def test_compiled_reaches_the_flow_transforms(make, monkeypatch):
     monkeypatch.setattr(shutil, "which", lambda name: name)
     for compiled in (False, True):
         env = make(representations=["obj", "seg"], compiled=compiled)
@@ -195,7 +195,7 @@ def test_flow_is_compiled_where_that_is_asked_for(make, monkeypatch):
         assert flows == [compiled, compiled]
 
 
-def test_pictures_and_estimator_have_one_scale_however_flow_is_named(make):
+def test_rendered_pictures_and_flow_estimator_have_the_same_scale(make):
     pytest.importorskip("cv2", reason="DIS is OpenCV's: pip install 'flowrep-rl[flow]'")
     for flow in ("estimated", {"source": "estimated"}, {"source": "estimated", "picture_scale": 2}):
         env = make(representations=["raw"], flow=flow, picture_scale=2, seed=0)
@@ -212,7 +212,7 @@ def test_options_of_a_representation_reach_its_transform(make):
     assert (near < 1).any()
 
 
-def test_an_episode_that_ends_begins_anew_alone(make):
+def test_an_env_that_ends_is_reset_alone(make):
     env = make(representations=["seg"], num_envs=3, seed=1)
     # The first turns off the road within 20 steps; the others go straight on.
     actions = torch.tensor([[1, 0, 0]]).expand(30, 3)
@@ -236,7 +236,7 @@ def test_an_episode_that_ends_begins_anew_alone(make):
     assert torch.equal(steps["seg"][first + 1, 1:], steps["next", "seg"][first, 1:])
 
 
-def test_an_episode_has_the_same_noise_wherever_it_is_driven(make):
+def test_noise_depends_on_the_episode_and_step_alone(make):
     make = partial(make, representations=["depth2", "obj", "ego"], noise=NOISE)
     actions = actions_of(3, 3)
     many, _ = play(make(num_envs=3, seed=4), actions)
@@ -251,7 +251,7 @@ def test_an_episode_has_the_same_noise_wherever_it_is_driven(make):
 
 
 @pytest.mark.slow
-def test_workers_give_what_one_process_gives(make):
+def test_envs_in_workers_equal_envs_in_one_process(make):
     actions = actions_of(40, 3)
     arguments = {"representations": ["ego", "obj"], "num_envs": 3, "keep_sensor": True}
     alone, _ = play(make(**arguments, seed=7), actions)
@@ -275,14 +275,14 @@ def test_a_worker_steps_streets_without_pytorch(make):
     assert "libtorch" not in loaded
 
 
-def test_what_is_imported_late_is_public_too():
+def test_public_names_are_imported_on_first_use():
     for name in envs.__all__:
         assert getattr(envs, name).__name__ == name
     with pytest.raises(AttributeError, match="no attribute 'make_envs'"):
         _ = envs.make_envs
 
 
-def test_a_step_begun_early_is_the_step(make, in_workers):
+def test_begin_step_does_not_change_the_step(make, in_workers):
     late, early = make(num_envs=2), in_workers
     for env in (late, early):
         env.set_seed(np.int64(3))
@@ -293,7 +293,7 @@ def test_a_step_begun_early_is_the_step(make, in_workers):
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("num_workers", [0, 2])
-def test_a_street_on_cuda_is_the_street_on_the_cpu(make, num_workers):
+def test_an_env_on_cuda_equals_the_env_on_the_cpu(make, num_workers):
     actions = actions_of(40, 2)
     arguments = {"representations": ["ego", "obj", "seg2"], "num_envs": 2, "seed": 1}
     here, _ = play(make(**arguments), actions)
@@ -305,7 +305,7 @@ def test_a_street_on_cuda_is_the_street_on_the_cpu(make, num_workers):
         torch.testing.assert_close(there[key].cpu(), here[key], rtol=1e-4, atol=1e-4)
 
 
-def test_workers_take_cores_and_their_streets_are_out_of_reach(make, in_workers, monkeypatch):
+def test_workers_occupy_cores_and_hide_their_streets(make, in_workers, monkeypatch):
     monkeypatch.setattr("flowrep.envs.torchrl_env.available_cores", lambda: 4)
     assert has_spare_cores(in_workers, 2)
     assert not has_spare_cores(in_workers, 3)
@@ -333,7 +333,7 @@ def test_states_pass_between_workers_and_one_process(make, noise):
     assert differing(expected, resumed) == []
 
 
-def test_which_episodes_come_does_not_depend_on_the_policy(make):
+def test_the_order_of_episodes_does_not_depend_on_the_policy(make):
     def seeds(actions):
         env = make(representations=(), num_envs=2, seed=5)
         steps, _ = play(env, actions)
@@ -345,7 +345,7 @@ def test_which_episodes_come_does_not_depend_on_the_policy(make):
     assert drawn[0] != drawn[1]
 
 
-def test_what_was_hit_stands_beside_the_outcome(make):
+def test_hit_is_the_class_of_what_the_vehicle_hit(make):
     env = make(representations=(), num_envs=3, seed=1)
     steps, _ = play(env, torch.zeros(200, 3, dtype=torch.long))
     outcome, hit = steps["next", "outcome"], steps["next", "hit"]

@@ -25,7 +25,7 @@ def make(**arguments):
     [{"sensors": SENSORS}, {"sensors": ("depth", "prev_from_curr")}, {"renderer": "pybullet"}],
     ids=str,
 )
-def test_steps_and_partial_resets_are_those_of_streets_alone(make_street, arguments):
+def test_streets_drawn_together_equal_single_streets(make_street, arguments):
     vector = make(**arguments)
     streets = [make_street("h_shaped_pathways", **arguments) for _ in range(NUM_ENVS)]
     paths = [path.name for path in streets[0].scene.paths]
@@ -75,7 +75,7 @@ def test_environments_with_different_cameras_are_not_drawn_together():
         StreetVectorEnv([one, other])
 
 
-def test_the_largest_seed_of_an_episode_is_in_the_spaces_which_can_be_sampled():
+def test_the_largest_episode_seed_is_in_the_observation_space():
     vector = make(sensors=("frame",))
     observation, _ = vector.reset(options={"episode_seed": (1 << 62) - 1})
     assert observation in vector.observation_space
@@ -84,7 +84,7 @@ def test_the_largest_seed_of_an_episode_is_in_the_spaces_which_can_be_sampled():
 
 
 @pytest.mark.parametrize("mask", [(True, False, False), (False, False, False)])
-def test_a_reset_of_some_or_none_returns_what_was_last_seen_as_the_callers_own(mask):
+def test_a_partial_reset_returns_the_others_last_observation_as_a_copy(mask):
     ours = make(sensors=("depth",))
     options, others = {"reset_mask": np.array(mask)}, ~np.array(mask)
     before, _ = ours.reset(options=dict(options))
@@ -101,7 +101,7 @@ def test_a_reset_of_some_or_none_returns_what_was_last_seen_as_the_callers_own(m
     assert ours.step(np.zeros(NUM_ENVS, dtype=int))[0]["sensor"]["depth"].any()
 
 
-def test_people_who_are_foreseen_are_where_their_clock_puts_them(make_street):
+def test_poses_computed_ahead_equal_those_at_the_step(make_street):
     env = make_street("three_way_junction", sensors=(), frame_rate_hz=10.0)
     env.reset(options={"episode_seed": 3, "vehicle_speed_mps": 0.0})
     for _ in range(40):

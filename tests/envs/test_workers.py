@@ -77,7 +77,7 @@ def in_process(num_envs):
     return SyncVectorEnv(factories, autoreset_mode=AutoresetMode.DISABLED)
 
 
-def test_it_is_the_vector_env_of_one_process(make):
+def test_workers_equal_gymnasiums_sync_vector_env(make):
     ours, theirs = make(5, 3), in_process(5)
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
@@ -95,7 +95,7 @@ def test_it_is_the_vector_env_of_one_process(make):
     assert differing(begun, kept) == []  # what was returned belongs to the caller
 
 
-def test_a_step_can_be_begun_and_asked_for_later_or_dropped_by_a_reset(make):
+def test_a_step_begun_early_is_returned_later_or_dropped_by_a_reset(make):
     ours, theirs = make(3, 2), in_process(3)
     for env in (ours, theirs):
         env.reset(seed=0)
@@ -111,7 +111,7 @@ def test_a_step_can_be_begun_and_asked_for_later_or_dropped_by_a_reset(make):
     assert differing(ours.step(actions), theirs.step(actions)) == []
 
 
-def test_every_environment_can_be_asked_and_told(make):
+def test_call_reaches_the_methods_of_every_env(make):
     env = make(5, 2)
     observation, _ = env.reset(seed=0)
     assert env.call("get_state") == tuple(observation["count"][:, 1])
@@ -127,7 +127,7 @@ def test_every_environment_can_be_asked_and_told(make):
         (17, r"environments 2 to 3 .*-9.*memory"),
     ],
 )
-def test_a_worker_that_failed_or_was_killed_is_told(make, action, told):
+def test_an_error_names_the_envs_of_a_worker_that_failed_or_was_killed(make, action, told):
     env = make(4, 2)
     env.reset(seed=0)
     with pytest.raises(WorkerError, match=told):
@@ -147,14 +147,14 @@ class EndsWhatUnpicklesIt:
         return os._exit, (3,)
 
 
-def test_a_worker_that_ends_by_itself_is_not_taken_for_one_that_was_killed():
+def test_an_error_has_the_exit_code_of_a_worker_that_ended():
     with pytest.raises(WorkerError, match=r"exit code 3\)") as caught:
         WorkerVectorEnv([EndsWhatUnpicklesIt()] * 2, 2)
     assert "memory" not in str(caught.value)
 
 
 @pytest.mark.parametrize("how", ["lambda", "local class", "open file"])
-def test_a_factory_that_can_not_be_sent_is_refused_with_what_to_do(how, tmp_path):
+def test_a_factory_that_can_not_be_pickled_is_refused(how, tmp_path):
     class Local(Counter):
         pass
 
@@ -168,7 +168,7 @@ def test_a_factory_that_can_not_be_sent_is_refused_with_what_to_do(how, tmp_path
             WorkerVectorEnv([factory, factory], 2)
 
 
-def test_an_answer_that_was_not_waited_for_is_no_answer_to_what_comes_next(make):
+def test_the_answer_to_an_interrupted_call_is_discarded(make):
     env, other = make(3, 2), in_process(3)
     for each in (env, other):
         each.reset(seed=0)
@@ -183,7 +183,7 @@ def test_an_answer_that_was_not_waited_for_is_no_answer_to_what_comes_next(make)
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="looks into /proc")
-def test_signals_of_terminals_and_schedulers_reach_no_worker_from_its_first_moment_on(make):
+def test_workers_block_stop_signals_from_their_start(make):
     worker = make(2, 2)._workers[0]
     with open(f"/proc/{worker.process.pid}/status") as file:
         blocked = int(dict(line.split(":") for line in file)["SigBlk"], 16)
@@ -193,9 +193,7 @@ def test_signals_of_terminals_and_schedulers_reach_no_worker_from_its_first_mome
 
 
 @pytest.mark.parametrize("is_asked_to_stop", [False, True])
-def test_a_suspended_worker_is_named_and_neither_waited_for_nor_left_behind(
-    make, monkeypatch, is_asked_to_stop
-):
+def test_a_suspended_worker_is_named_and_killed(make, monkeypatch, is_asked_to_stop):
     short = "PATIENCE_AFTER_STOP_S" if is_asked_to_stop else "PATIENCE_S"
     env = make(4, 2)
     env.reset(seed=0)

@@ -64,6 +64,9 @@ def refusal(data, changes):
         ({"building_rows": [BUILDING_ROW | {"to_m": -9}]}, "building_rows[0]"),
         ({"building_rows": [BUILDING_ROW | {"side": "end"}]}, "building_rows[0]"),
         ({"building_rows": [BUILDING_ROW | {"from_m": -1e10}]}, "building_rows[0].from_m"),
+        # Steps of a twelfth of a second past the 200 m that are seen.
+        ({"vehicle.speed_mps": 1e7}, "vehicle.speed_mps"),
+        ({"pedestrian_speed_mps.high": [2.0, 1e8]}, "pedestrian_speed_mps.high"),
         # Rows of which nothing would be placed, or too much: the sidewalk is 2 m wide, and a house
         # at least 7 m; the arms take the ground beside the last 5 m of the stem.
         ({"building_rows": [BUILDING_ROW | {"setback_m": 1.9}]}, "building_rows[0].setback_m"),
@@ -112,7 +115,7 @@ def refusal(data, changes):
         ({"obstacles": [CAR_BESIDE]}, "pedestrian_groups.across.walk: goes through a car at (22.8"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_is_refused(data, changes, key):
+def test_an_invalid_scene_is_refused_with_its_key(data, changes, key):
     assert refusal(data, changes).startswith(f"{key}: " if ":" not in key else key)
 
 
@@ -161,7 +164,7 @@ def through(name, count, spread_m, *points):
         ),
     ],
 )
-def test_people_who_would_stand_in_each_other_are_refused(straight_road, groups, expected):
+def test_walks_on_which_people_could_overlap_are_refused(straight_road, groups, expected):
     with pytest.raises(SceneError) as caught:
         load_scene(replace(straight_road, pedestrian_groups=tuple(groups)))
     assert f"pedestrian_groups.{expected}" in str(caught.value)

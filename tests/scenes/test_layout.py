@@ -65,7 +65,7 @@ def test_corners_are_rounded_where_roads_meet(data):
     assert not rounded.contains(shapely.Point(28.0, 7.0))
 
 
-def test_rows_leave_out_what_would_stand_in_the_way(data):
+def test_rows_leave_out_obstacles_on_other_roads(data):
     row = {"kind": "car", "road": "stem", "offset_m": 4.0, "from_m": 2.0, "to_m": 60.0}
     row |= {"every_m": 10.0, "size_m": [4.0, 1.8, 1.5]}
     layout = Layout(load_scene(data | {"obstacle_rows": [row], "obstacles": []}))

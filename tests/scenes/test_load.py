@@ -14,7 +14,7 @@ from flowrep.scenes.load import scene_data
 CROSSROADS = Path(__file__).parent / "crossroads.yaml"
 
 
-def test_name_file_mapping_and_scene_give_the_same_scene(data):
+def test_a_scene_is_loaded_by_name_file_mapping_or_scene(data):
     scene = load_scene(CROSSROADS)
     assert scene == load_scene(str(CROSSROADS)) == load_scene(data) == load_scene(scene)
     assert load_scene("straight_road").name == "straight_road"
@@ -22,7 +22,7 @@ def test_name_file_mapping_and_scene_give_the_same_scene(data):
     assert scene.time_limit_s == pytest.approx(12.5)
 
 
-def test_the_planner_drives_a_scene_it_was_not_made_for(drive):
+def test_the_planner_drives_a_scene_of_the_users(drive):
     outcomes = [e.outcome for e in drive("planner", 6, CROSSROADS)]
     assert outcomes.count("success") >= 5
 
@@ -36,7 +36,7 @@ def test_the_planner_drives_a_scene_it_was_not_made_for(drive):
         (CROSSROADS.read_bytes().replace(b"layout_seed", b"layout_sed"), "layout_sed: "),
     ],
 )  # fmt: skip
-def test_a_file_that_is_no_scene_is_refused_on_one_line(tmp_path, content, named):
+def test_an_invalid_file_is_refused_on_one_line(tmp_path, content, named):
     file = tmp_path / "odd.yaml"
     file.write_bytes(content)
     with pytest.raises(SceneError) as caught:
@@ -47,7 +47,7 @@ def test_a_file_that_is_no_scene_is_refused_on_one_line(tmp_path, content, named
 
 
 @pytest.mark.parametrize(("scene", "named"), [("straight", "straight_road"), ("a.yaml", "a.yaml")])
-def test_a_scene_that_does_not_exist_is_refused(tmp_path, monkeypatch, scene, named):
+def test_an_unknown_scene_is_refused(tmp_path, monkeypatch, scene, named):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SceneError, match=named):
         load_scene(scene)
@@ -79,7 +79,7 @@ def test_every_key_is_explained_in_the_page_and_in_editors():
 
 
 @pytest.mark.parametrize("file", [*sorted((CONF_DIR / "scene").glob("*.yaml")), CROSSROADS])
-def test_a_scene_is_written_as_its_file_has_it(file):
+def test_scene_data_equals_the_file(file):
     written = yaml.safe_load(yaml.safe_dump(scene_data(load_scene(file))))
     assert written == yaml.safe_load(file.read_text(encoding="utf-8"))
 

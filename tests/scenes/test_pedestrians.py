@@ -47,7 +47,7 @@ def crowd():
         (20.0, [(0, 0), (1, 3), (0, 3)]),  # B, 40 m on, has 2 m of its third way back to go
     ],
 )
-def test_everyone_is_where_the_timetable_says(crowd, time_s, expected):
+def test_people_walk_to_and_fro_on_schedule(crowd, time_s, expected):
     np.testing.assert_allclose(crowd.positions(time_s), expected, atol=1e-12)
     np.testing.assert_allclose(crowd.poses(time_s)[:, :2], expected, atol=1e-12)
 
@@ -71,13 +71,13 @@ def test_people_look_where_they_walk_and_turn_about_at_the_ends(crowd):
     assert looks(2.8, 1) == pytest.approx(0.0)  # +x, round the corner
 
 
-def test_one_who_stands_keeps_the_very_same_pose(crowd):
+def test_a_standing_person_keeps_exactly_the_same_pose(crowd):
     first = crowd.poses(0.0)[2]
     for time_s in (0.1, 1 / 3, 7.7):
         assert np.array_equal(crowd.poses(time_s)[2], first)
 
 
-def test_many_times_at_once_are_many_calls(crowd):
+def test_poses_at_many_times_equal_single_calls(crowd):
     times = np.array([0.0, 0.7, 3.3, 12.1])
     for method in (crowd.positions, crowd.poses):
         np.testing.assert_array_equal(method(times[:, None]), [method(time_s) for time_s in times])
@@ -200,7 +200,7 @@ def least_distance(scene, speed_mps, episodes):
 
 @pytest.mark.parametrize("speed_mps", [(1.2, 1.8), (0.0, 5.0)])
 @pytest.mark.parametrize("name", [*scene_names(), CROSSROADS])
-def test_nobody_ever_stands_in_another(name, speed_mps):
+def test_people_never_overlap(name, speed_mps):
     assert least_distance(load_scene(name), speed_mps, episodes=15) >= 0.6
 
 

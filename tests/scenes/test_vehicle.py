@@ -42,7 +42,7 @@ def test_a_turning_vehicle_stays_on_its_circle():
     assert right == pytest.approx((20.0, -20.0, -math.pi / 2, -0.5))
 
 
-def test_many_short_rolls_are_one_long_one_and_who_stands_keeps_the_very_numbers():
+def test_many_short_rolls_equal_one_long_roll_and_a_roll_at_rest_changes_nothing():
     state = STATE
     for _ in range(24):
         state = roll(state, 1 / 24, 10.0)
@@ -51,7 +51,7 @@ def test_many_short_rolls_are_one_long_one_and_who_stands_keeps_the_very_numbers
     assert roll(state, 1 / 24, 0.0) == state
 
 
-def test_arrays_are_driven_as_numbers_are():
+def test_arrays_of_states_are_driven_like_single_states():
     both = (STATE, VehicleState(-1.0, 7.0, 3.0, 0.0), VehicleState(0.0, 0.0, 0.0, -0.6))
     actions = [NO_OP, TURN_LEFT, TURN_RIGHT]
     states = VehicleState(*(np.array(field) for field in zip(*both)))

@@ -7,14 +7,14 @@ import pytest
 from flowrep.simulator.camera import choose_renderer
 
 
-def test_the_rasteriser_is_taken_unless_pybullet_is_asked_for():
+def test_the_rasteriser_is_the_default_renderer():
     for asked, taken in ("auto", "rasteriser"), ("rasteriser",) * 2, ("pybullet",) * 2:
         assert choose_renderer(asked) == taken
     with pytest.raises(ValueError, match=r"unknown renderer 'opengl'.* rasteriser"):
         choose_renderer("opengl")
 
 
-def test_numba_is_imported_where_something_is_drawn_and_not_before(monkeypatch):
+def test_numba_is_imported_only_for_drawing(monkeypatch):
     from flowrep.envs import StreetEnv
 
     # None is what Python finds where a module can't be imported.

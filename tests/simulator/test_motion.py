@@ -15,7 +15,7 @@ BODIES = np.stack([planar(10.1, 2.2, 0.4), planar(12.0, -3.0, 1.0), planar(7.9, 
 
 
 @pytest.mark.parametrize("far_m", [0.0, 10_000.0])
-def test_motions_are_those_of_the_geometry(far_m):
+def test_numpy_motions_equal_those_of_geometry(far_m):
     away = planar(far_m, -far_m, 0.0)
     before, now = (away @ planar(*at) @ MOUNT for at in ((3.0, -1.0, 0.3), (3.8, -0.7, 0.42)))
     given = before, now, away @ BODIES_BEFORE, away @ BODIES
@@ -29,7 +29,7 @@ def test_motions_are_those_of_the_geometry(far_m):
     np.testing.assert_allclose(rigid_inverse(now) @ now, np.eye(4), **same)
 
 
-def test_what_stands_has_the_exact_numbers_of_the_static_world():
+def test_bodies_at_rest_have_exactly_the_static_worlds_motion():
     before, now = planar(3.0, -1.0, 0.3) @ MOUNT, planar(3.8, -0.7, 0.42) @ MOUNT
     rows = instance_motion(before, now, BODIES_BEFORE, BODIES)
     assert np.array_equal(rows[0], relative_motion(before, now))

@@ -67,7 +67,7 @@ def test_depth_on_a_slanted_plane_is_the_rays():
     np.testing.assert_allclose(depth[seen], (6.0 / (1 - 0.6 * a + 0.5 * b))[seen], rtol=1e-6)
 
 
-def test_the_nearer_one_hides_the_farther_whatever_their_order():
+def test_the_nearer_triangle_hides_the_farther_one_in_any_order():
     near, far = facing(2.0, -9, 0.1, -9, 9, BALL), facing(4.0, -9, 9, -9, 9, WALL)
     # The near one ends at u = 5·0.1/2 + 3.5 = 3.75: columns 0 to 3.
     for bodies in ((near, far), (far, near)):
@@ -76,13 +76,13 @@ def test_the_nearer_one_hides_the_farther_whatever_their_order():
         np.testing.assert_array_equal(semantic[2], [4] * 4 + [3] * 5)
 
 
-def test_nothing_is_seen_from_behind():
+def test_triangles_are_invisible_from_behind():
     corners = [(-9, 9, 2.0), (9, 9, 2.0), (9, -9, 2.0), (-9, -9, 2.0)]
     assert np.isfinite(see(quad(corners))[0]).all()
     assert not np.isfinite(see(quad(corners[::-1]))[0]).any()
 
 
-def test_a_floor_that_runs_on_behind_the_camera_is_cut_at_the_near_plane():
+def test_a_floor_behind_the_camera_is_cut_at_the_near_plane():
     # 1 m below the camera, from 50 m behind it to 50 m ahead: row j sees it at
     # z = 1 / b, b = (j + 0.5 - 2) / 4, where that is from 0.5 to 50 m: rows 2 (8 m) to 5 (1.14 m).
     floor = quad([(-80, 1, -50), (80, 1, -50), (80, 1, 50), (-80, 1, 50)])
@@ -96,11 +96,11 @@ def test_a_floor_that_runs_on_behind_the_camera_is_cut_at_the_near_plane():
 
 
 @pytest.mark.parametrize(("z", "is_seen"), [(0.49, 0), (0.51, 1), (99.0, 1), (101.0, 0)])
-def test_only_what_lies_between_the_two_planes_is_seen(z, is_seen):
+def test_only_surfaces_between_near_and_far_plane_are_seen(z, is_seen):
     assert np.isfinite(see(facing(z, -200, 200, -200, 200))[0]).all() == is_seen
 
 
-def test_a_wall_that_runs_into_the_distance_ends_at_the_far_plane():
+def test_a_wall_ends_at_the_far_plane():
     # 2 m to the right, from 1 m to 500 m ahead: column i sees it at z = 2 · 5 / (i + 0.5 - 3.5).
     wall = quad([(2, 600, 1), (2, 600, 500), (2, -600, 500), (2, -600, 1)][::-1])
     depth, *_ = see(wall)
@@ -122,7 +122,7 @@ def test_bodies_move_with_their_poses_and_the_camera_with_its_own():
     assert depth[2, 4] == 9.0
 
 
-def test_a_body_that_is_not_there_hides_nothing():
+def test_a_body_that_is_not_shown_hides_nothing():
     near, far = facing(2.0, -9, 9, -9, 9, BALL), facing(4.0, -9, 9, -9, 9)
     np.testing.assert_array_equal(see(near, far, is_shown=[False, True])[0], 4.0)
     np.testing.assert_array_equal(see(near, far, is_shown=[True, True])[0], 2.0)
