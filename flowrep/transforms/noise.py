@@ -195,7 +195,8 @@ class SensorNoise(MapTransform):
 
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
         """Returns unbounded specs, as errors are unbounded."""
-        return tuple(Unbounded(s.shape, device=s.device, dtype=s.dtype) for s in specs)
+        seen = specs[: len(self.out_keys)]  # without the frame's
+        return tuple(Unbounded(s.shape, device=s.device, dtype=s.dtype) for s in seen)
 
 
 def _drawn_seed() -> int:
