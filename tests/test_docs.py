@@ -13,7 +13,7 @@ import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from tensordict import TensorDict
 from torchrl.data import Composite, Unbounded
-from torchrl.envs import Transform, TransformedEnv, check_env_specs
+from torchrl.envs import Transform
 
 from docs import docstrings
 from flowrep import transforms
@@ -168,17 +168,6 @@ def test_an_agent_is_trained_evaluated_saved_and_loaded_as_the_page_of_runs_says
     assert scope["agent"].frames == 256
     (folder,) = (tmp_path / "outputs").glob("*/*_straight_road_ego+obj_s0")
     assert (folder / "checkpoint" / "latest.safetensors").exists()
-
-
-def test_the_guides_own_representation_works_in_an_env():
-    scope: dict = {}
-    exec(python_of(DOCS / "adding_a_representation.md"), scope)
-    env = TransformedEnv(FakeSensorEnv((2,)), scope["Edges"]())
-    check_env_specs(env, seed=None)
-    near = torch.tensor([[[2.0, 2.0, 4.0], [2.0, 4.0, torch.inf]]])
-    (edges,) = scope["Edges"](factor=1.0).compute(near)
-    # 1/z is .5 .5 .25 over .5 .25 0: jumps to the right 0 .25 0, .25 .25 0; below 0 .25 .25
-    assert edges.tolist() == [[[0.0, 0.5, 1.0], [0.5, 1.0, 0.0]]]
 
 
 def test_commands_quote_their_lists_for_every_shell():
