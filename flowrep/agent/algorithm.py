@@ -93,6 +93,7 @@ class Algorithm(ABC):
             SoftUpdate(loss, tau=tau)  # keeps TorchRL from warning that nothing moves the targets
         self.tau = tau
         self.weights = weights_of(loss) | dict(self.other_weights())
+        # Pairs of tensors for `after_update`: each target and the weight that it follows.
         targets = [name for name in self.weights if name.startswith("target_")]
         self._targets = [self.weights[name] for name in targets]
         self._followed = [self.weights[name.removeprefix("target_")].data for name in targets]
@@ -208,6 +209,7 @@ class Algorithm(ABC):
         Once a loss or a gradient is nan or infinite, the weights no longer change and
         `divergence.check()` raises.
         """
+        # Not below 0: a step of all envs may go beyond the last frame and bring one more update.
         learning_rate = self.learning_rate * max(0.0, 1 - self.updates / self.total_updates)
         for group in self.optimizer.param_groups:
             group["lr"].fill_(learning_rate * group["factor"])

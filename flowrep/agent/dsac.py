@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictParams
 from torch import Tensor
-from torchrl.objectives import DiscreteSACLoss, LossModule, ValueEstimators
+from torchrl.objectives import DiscreteSACLoss, LossModule
 
 from flowrep.agent import networks
 from flowrep.agent.algorithm import OffPolicy, td_target, transition_keys
@@ -62,19 +62,14 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
             target_entropy="auto",
             target_entropy_weight=options.target_entropy_weight,
         )
-        self.make_value_estimator(ValueEstimators.TD0, gamma=options.gamma)
-        self.codecs, self.actions, self.encoder_is_shared = actor.codecs, actions, shared
+        self.codecs, self.actions, self.gamma = actor.codecs, actions, options.gamma
+        self.encoder_is_shared = shared
         self.convert_to_functional(critic_encoder, "critic_encoder", create_target_params=True)
         if not shared:
             self.convert_to_functional(actor.encoder, "actor_encoder")
 
     def _set_in_keys(self) -> None:
         self._in_keys = transition_keys(self.codecs)
-
-    def make_value_estimator(self, *args: Any, **options: Any) -> None:
-        """Sets γ; y is the TD(0) target, whatever the type."""
-        super().make_value_estimator(*args, **options)
-        self.gamma = float(self.value_estimator.gamma)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns the losses of a batch, with gradients, and further metrics, without."""

@@ -100,8 +100,8 @@ class ClipPPOMapLoss(ClipPPOLoss):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns the losses of a batch, with gradients, and further metrics, without."""
-        noted = ("action", "action_log_prob", "advantage", "value_target")
-        embedded = tensordict.select(*noted).set("embedding", self.embed(tensordict))
+        read = ("action", "action_log_prob", "advantage", "value_target")
+        embedded = tensordict.select(*read).set("embedding", self.embed(tensordict))
         out = super().forward(embedded)
         return out.set("explained_variance", out["explained_variance"].squeeze())
 
@@ -181,6 +181,7 @@ class PPO(Algorithm):
             self.memory.clear()  # each frame belongs to one round
             size = self.options.batch_size
             for _ in range(self.options.epochs):
+                # Shuffled, as neighbouring steps are alike: batches in their order are biased.
                 rows = torch.randperm(len(self._round)).split(size)
                 self._batches += [r for r in rows if len(r) == size]
         return self._round[self._batches.pop(0).to(self._round["action"].device)]
@@ -188,8 +189,9 @@ class PPO(Algorithm):
     @torch.no_grad()
     def _with_advantages(self, steps: TensorDictBase) -> TensorDictBase:
         """Adds `advantage` and `value_target`, by the current weights, to steps `[N, T]`."""
-        for some in (steps, steps["next"]):
-            parts = some.reshape(-1).split(self.options.batch_size)  # as in training
+        for observed in (steps, steps["next"]):
+            # In batches as large as those of updates, which bounds the memory.
+            parts = observed.reshape(-1).split(self.options.batch_size)
             values = torch.cat([self.loss.state_value(part) for part in parts])
-            some["state_value"] = values.reshape(*steps.shape, 1)
+            observed["state_value"] = values.reshape(*steps.shape, 1)
         return self._advantage(steps)
