@@ -466,7 +466,7 @@ def _number(value: Any) -> float:
     # Not from geometry.checks, since workers step envs without PyTorch.
     try:
         return math.nan if isinstance(value, str) else float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return math.nan
 
 

@@ -286,6 +286,7 @@ def test_invalid_reset_options_are_refused(make_street, empty_road):
         ("vehicle_speed_mps", math.nan, "vehicle_speed_mps is nan"),
         ("vehicle_speed_mps", -10.0, "vehicle_speed_mps is -10.0"),
         ("vehicle_speed_mps", "10", "vehicle_speed_mps is '10'"),
+        ("vehicle_speed_mps", 10**400, "vehicle_speed_mps is 10"),
         ("speed", (1.0, math.nan), r"speed is \(1.0, nan\)"),
         ("state", 5, "get_state"),
         ("state", {"steps": 3}, "get_state: outcome"),
