@@ -699,7 +699,6 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
             any_collapsed=any(number for each in held_out for number in each.collapsed),
             beside=beside_table(others),
             others=[{name: _points(c) for name, c in of.items()} for of in others],
-            held_out_runs=sum(len(cell.runs) for cell in cells),
             above=above_the_planner(cells),
             held_out_seeds=sorted({run.seed for cell in cells for run in cell.runs}),
             cells={cell.title: cell_table(cell) for cell in cells},
