@@ -30,6 +30,15 @@ def _without_titles(node: Any) -> Any:  # which repeat the keys
     return {key: _without_titles(value) for key, value in node.items() if key != "title"}
 
 
+def lines(node: Any, depth: int = 4, indent: str = "") -> str:
+    """Returns JSON in which a key of a scene, `depth` below the whole, is a line."""
+    if depth == 0 or not isinstance(node, dict):
+        return json.dumps(node, ensure_ascii=False)
+    inner = indent + " "
+    parts = [f"{inner}{json.dumps(k)}: {lines(node[k], depth - 1, inner)}" for k in node]
+    return "{\n" + ",\n".join(parts) + f"\n{indent}}}"
+
+
 def rows(part: dict[str, Any], parts: dict[str, Any], prefix: str = "") -> Iterator[str]:
     """Yields a row of the page's table for each key, with those within it below."""
     for key, field in part["properties"].items():
@@ -50,5 +59,5 @@ def page(text: str) -> str:
 
 
 if __name__ == "__main__":
-    SCHEMA.write_text(json.dumps(schema(), indent=1, ensure_ascii=False) + "\n", "utf-8")
+    SCHEMA.write_text(lines(schema()) + "\n", "utf-8")
     PAGE.write_text(page(PAGE.read_text("utf-8")), "utf-8")
