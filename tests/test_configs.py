@@ -6,7 +6,7 @@ from unittest.mock import Mock
 import pytest
 import torch
 
-from flowrep.config import CONF_DIR, config_groups, group_choices
+from flowrep.config import config_groups, group_choices
 from tests.config.composing import composed, plain
 
 pytest.importorskip("pybullet", reason="composed configs are built into environments")
@@ -84,18 +84,6 @@ def test_workers_step_environments_where_cores_are_free(
     monkeypatch.setattr(build, "device", torch.device)
     build.env(composed(change, "num_envs=4", "algorithm.batch_size=64", f"device={device}"))
     assert made.call_args.kwargs["num_workers"] == workers
-
-
-def test_a_scene_of_one_s_own_is_found_beside_the_package_s(tmp_path):
-    from flowrep.experiment import build
-
-    crossroads = CONF_DIR.parent / "tests" / "scenes" / "crossroads.yaml"
-    (tmp_path / "scene").mkdir()
-    (tmp_path / "scene" / "mine.yaml").write_text(crossroads.read_text())
-    config = composed(f"hydra.searchpath=[file://{tmp_path}]", "scene=mine", "num_envs=1")
-    env = build.env(config, device="cpu")
-    assert env.rollout(2)["ego"].shape == (1, 2, 2, 40, 60)
-    env.close()
 
 
 @pytest.mark.parametrize(("scene", "mirrors"), [("three_way_junction", True), ("s_turn", False)])

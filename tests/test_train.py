@@ -109,7 +109,8 @@ def test_a_run_is_evaluated_beside_baselines_at_every_speed(smoke_run):
 
 
 def test_a_run_says_what_it_is_where_it_runs_and_how_it_went(smoke_run):
-    what = ["DiscreteSAC", "[ego,obj]", "straight_road", "preset=paper", "device: "]
+    what = ["DiscreteSAC", "[ego,obj]", "straight_road", "debug=smoke", "device: "]
+    what += ["evaluation.final_episodes=4"]
     how = ["greedy", "never_turn", "normal", "out of bounds", "wall time: "]
     assert [word for word in what + how if word not in smoke_run[1]] == []
 

@@ -64,28 +64,37 @@ def run_hydra(config_name: str, job: Callable[[DictConfig], Any], schema: type[C
             stream.reconfigure(errors="replace", line_buffering=True)
     if not sys.flags.safe_path and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # for policies and classes in modules there, as with -m
-    register_resolvers()
+    _show_if_asked(sys.argv[1:], config_name)
     main = hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name=config_name)
-    typed = sys.argv[1:]
     try:
-        sys.argv[1:] = as_typed(typed, schema)
-        _show_if_asked(typed, config_name)
-        # Hydra raises its errors, not prints them.
-        with env_override({"HYDRA_FULL_ERROR": "1"}), checked_files():
+        typed = sys.argv[1:] = as_typed(sys.argv[1:], schema)
+        with _composing(typed), env_override({"HYDRA_FULL_ERROR": "1"}):  # raise, don't print
             main(job)()
     except KeyboardInterrupt:
         sys.exit(130)
-    except OSError as error:
-        place = "the output folder can't be created, give another with hydra.run.dir="
-        end_with(error if isinstance(error, HydraException) else UsageError(f"{error}: {place}"))
     except Exception as error:
-        # The job ends with its own errors. These are of a line of which Hydra can't make a config,
-        # for instance since there is a list where it expects a name, so they may be of any class.
+        end_with(error)
+
+
+@contextmanager
+def _composing(typed: Sequence[str]) -> Iterator[None]:
+    """Has Hydra read nothing of a stranger's but data, and its errors name what was typed."""
+    register_resolvers()
+    try:
+        with checked_files():
+            yield
+    except Exception as error:
+        # A job ends with its own errors. The others are of a line of which Hydra can't make a
+        # config, for instance since there is a list where it expects a name, and of any class.
         text = explained(error)
-        is_of_hydra = isinstance(error, HydraException) or not is_a_mistake(error)
-        if is_of_hydra and not any(each in text for each in typed):
+        is_of_hydra = isinstance(error, HydraException | OmegaConfBaseException)
+        if is_a_mistake(error) and not is_of_hydra and not isinstance(error, OSError):
+            raise
+        if isinstance(error, OSError) and not is_of_hydra:
+            text += ": give another folder with hydra.run.dir="
+        elif not any(each in text for each in typed):
             text = f"{shlex.join(typed)}: {text}"
-        end_with(error if IS_DEBUGGING else UsageError(text))
+        raise UsageError(text) from error
 
 
 def composed(schema: type[Model], values: Mapping[str, Any]) -> tuple[Model, str, list[str]]:
@@ -94,26 +103,15 @@ def composed(schema: type[Model], values: Mapping[str, Any]) -> tuple[Model, str
     Also returns the folder that `flowrep.train` would choose, and the values as overrides.
     """
     typed = list(_overrides(values))
-    register_resolvers()
+    outer = get_gh_backup()  # of the script that calls, which may use Hydra itself
+    GlobalHydra.instance().clear()
     try:
         with (
-            _own_hydra(),
-            checked_files(),
+            _composing(typed),
             hydra.initialize_config_dir(str(CONF_DIR), version_base="1.3"),
         ):
             config = hydra.compose("train", typed, return_hydra_config=True)
-        return checked(config, schema), str(config.hydra.run.dir), typed
-    except (HydraException, OmegaConfBaseException, ValueError) as error:
-        raise UsageError(explained(error)) from None
-
-
-@contextmanager
-def _own_hydra() -> Iterator[None]:
-    """Sets Hydra's global state aside, which the script that calls may use itself."""
-    outer = get_gh_backup()
-    GlobalHydra.instance().clear()
-    try:
-        yield
+            return checked(config, schema), str(config.hydra.run.dir), typed
     finally:
         restore_gh_from_backup(outer)
 
@@ -135,7 +133,9 @@ def _overrides(values: Mapping[str, Any], section: str = "") -> Iterator[str]:
 
 def checked(config: DictConfig, schema: type[Model]) -> Model:
     """Returns a composed config as its model; keys that the user added (`+note=pilot`) pass."""
-    plain, job = plain_config(config), config.get("hydra") or HydraConfig.get()
+    job = config.get("hydra") or HydraConfig.get()
+    own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+    plain: Any = OmegaConf.to_container(own, resolve=True, throw_on_missing=True)
     model: Any = validated(schema, plain)
     _check_no_file_is_hidden(job)
     typed = job.overrides.task
@@ -173,15 +173,6 @@ def _check_no_file_is_hidden(job: Any) -> None:
             if are_there and file.read_bytes() != ours.read_bytes():
                 why = "because flowrep has a file of the same name: rename yours"
                 raise UsageError(f"{file} would be ignored, {why}")
-
-
-def plain_config(config: DictConfig) -> dict[str, Any]:
-    """Returns a composed config as plain data, without Hydra's, with interpolations resolved."""
-    keys = [str(key) for key in config if key != "hydra"]
-    plain: Any = OmegaConf.to_container(
-        OmegaConf.masked_copy(config, keys), resolve=True, throw_on_missing=True
-    )
-    return plain
 
 
 # Mistakes.
@@ -301,23 +292,15 @@ def line_for(command: str, **values: str) -> str:
 
 
 def _show_if_asked(arguments: Sequence[str], config_name: str) -> None:
-    """Ends the process after --version or --help, which prints conf/ without Hydra's lines."""
+    """Ends the process after --version or --help, which prints the command's file of conf/."""
     if "--version" in arguments:
         print(f"flowrep {__version__}")
         sys.exit(0)
-    if not {"--help", "-h"} & {*arguments}:
-        return
-    text = (CONF_DIR / f"{config_name}.yaml").read_text(encoding="utf-8")
-    groups = [name for name in config_groups() if re.search(rf"(?m)^ +- {name}:", text)]
-    text = re.sub(r"(?m)^ +- (_self_|override|optional|run_folder).*\n", "", text)
-    if not groups:
-        text = text.replace("defaults:\n", "")
-    print(text.partition("\nhydra:")[0].rstrip())
-    if groups:
-        print("\nChoices of the groups:")
-    for group in groups:
-        print(f"  {group}: {', '.join(group_choices(group))}")
-    print("\nkey=value sets a key, group=choice chooses, -m runs each of several values.")
-    print("--cfg job shows the resulting config with all keys of its groups.")
-    print("--hydra-help lists Hydra's own flags.")
-    sys.exit(0)
+    if {"--help", "-h"} & {*arguments}:
+        text, _, _ = (CONF_DIR / f"{config_name}.yaml").read_text("utf-8").partition("\nhydra:")
+        print(re.sub(r"(?m)^ +- (_self_|override|optional|run_folder).*\n", "", text).rstrip())
+        print("\nkey=value sets a key, group=choice chooses, -m runs each of several values.")
+        print("--cfg job shows all keys, --hydra-help Hydra's own flags. The groups' choices:")
+        for group in config_groups():
+            print(f"  {group}: {', '.join(group_choices(group))}")
+        sys.exit(0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,12 @@ class _Loader(yaml.SafeLoader):
             names.append(key.value)
         return super().construct_mapping(node, deep)
 
+    def construct_yaml_int(self, node: Any) -> Any:
+        number = super().construct_yaml_int(node)
+        if abs(number) > sys.float_info.max:
+            raise _problem("a number that no float holds", node)
+        return number
+
     def _size(self, node: Any, sizes: dict[int, int | None]) -> int:
         """Returns how many values a node has with its aliases written out; `sizes` by identity."""
         if isinstance(node, yaml.ScalarNode):
@@ -53,6 +60,9 @@ class _Loader(yaml.SafeLoader):
         if size > MAX_NODES:
             raise _problem(f"its aliases stand for more than {MAX_NODES:,} values", node)
         return size
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
 
 
 def _problem(text: str, node: Any) -> yaml.MarkedYAMLError:

@@ -121,22 +121,20 @@ def test_errors_of_the_command_are_lines_too_unless_they_are_bugs(monkeypatch, c
         assert ("Traceback" in capsys.readouterr().err) is (code == 1)
 
 
-def test_help_has_the_comments_of_conf_and_the_choices(run):
-    code, _, said = run("train", "--help")
-    assert code == 0
-    assert "environment steps" in said.out
-    assert "laptop_long" in said.out
-    assert not any(word in said.out for word in ("_self_", "override hydra", "run_folder"))
-    _, _, said = run("train", "--version")
-    assert said.out == f"flowrep {flowrep.__version__}\n"
-
-
 @pytest.mark.parametrize("command", SCHEMAS)
-def test_help_begins_with_what_the_command_does(run, command):
-    _, _, said = run(command, "--help")
+def test_help_says_what_a_command_does_and_explains_its_keys(run, command):
+    code, _, said = run(command, "--help")
     sentence, example = said.out.splitlines()[:2]
+    assert code == 0
     assert re.fullmatch(r"# [A-Z].*\.", sentence)
     assert example.startswith(f"# python -m flowrep.{command} ")
+    assert re.search(r"^\w+: .+ # ", said.out, re.MULTILINE)
+    assert "laptop_long" in said.out
+    assert not any(word in said.out for word in ("_self_", "override hydra", "run_folder"))
+
+
+def test_a_command_knows_its_version(run):
+    assert run("train", "--version")[2].out == f"flowrep {flowrep.__version__}\n"
 
 
 @pytest.mark.parametrize("form", ["hydra.searchpath=[pkg://mypkg]", "--config-dir"])
@@ -269,33 +267,33 @@ def test_what_needs_no_quotes_has_none(monkeypatch):
     assert cli.line_for("evaluate", run=folder) == f"flowrep-evaluate run={folder}"
 
 
-@pytest.mark.parametrize("name", ["josé (2)", "a,b=[c]", 'José\'s "runs"', "${seed}"])
-def test_folders_that_are_there_are_taken_as_they_were_typed(tmp_path, monkeypatch, name):
+FOLDERS = [
+    # with names of any characters, or like numbers
+    ("run=josé (2)", "josé (2)"),
+    ("run=a,b=[c]", "a,b=[c]"),  # which is there
+    ("output=1e3", "1e3"),
+    ("hydra.sweep.dir=/home/josé/x (2)", "/home/josé/x (2)"),
+    # none, or none yet
+    ("run=[a,b]", ["a", "b"]),
+    ("input=0", 0),  # a camera's number
+    ("trajectories=2", 2),
+    ("resume=null", None),
+]
+
+
+@pytest.mark.parametrize(("typed", "value"), FOLDERS)
+def test_a_folder_is_taken_as_it_was_typed_and_nothing_else_is(tmp_path, monkeypatch, typed, value):
     monkeypatch.chdir(tmp_path)
-    for folder in (name, "b c"):
-        (tmp_path / folder).mkdir()
-    for line, expected in ([f"run={name}"], name), ([name, "videos=1", "b c"], [name, "b c"]):
-        typed = cli.as_typed(line, SCHEMAS["report"])
-        assert read(shlex.join(["report", *typed]))["run"] == expected
+    (tmp_path / "a,b=[c]").mkdir()
+    (line,) = cli.as_typed([typed], SCHEMAS["train"])
+    assert OverridesParser.create().parse_overrides([line])[0].value() == value
 
 
-def test_what_is_no_folder_stays_what_it_is():
-    typed = ["run=[a,b]", "+note=x", "~policy", "trajectories=2", "--cfg", "job", "resume="]
-    assert cli.as_typed(typed, SCHEMAS["report"]) == typed
-
-
-@pytest.mark.parametrize("key", ["hydra.run.dir", "hydra.sweep.dir", "resume"])
-def test_a_folder_that_hydra_can_not_read_is_quoted(key):
-    typed = cli.as_typed([f"{key}=/home/josé/x (2)"], SCHEMAS["train"])
-    (parsed,) = OverridesParser.create().parse_overrides(typed)
-    assert parsed.value() == "/home/josé/x (2)"
-
-
-@pytest.mark.parametrize("name", ["20240501", "1e3", "0x10", "true", "inf"])
-def test_a_folder_named_like_a_number_is_a_folder(name):
-    typed = cli.as_typed([f"output={name}", "input=0", "start=7"], SCHEMAS["factorize"])
-    assert read(shlex.join(["flowrep-factorize", typed[0]])) == {"output": name}
-    assert typed[1:] == ["input=0", "start=7"]  # a camera's number
+def test_folders_without_a_key_are_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "it's").mkdir()
+    typed = cli.as_typed(["it's", "videos=1", "b c"], SCHEMAS["report"])
+    assert read(shlex.join(["report", *typed])) == {"run": ["it's", "b c"], "videos": 1}
 
 
 # Names of folders.
