@@ -92,7 +92,7 @@ def _composing(typed: Sequence[str]) -> Iterator[None]:
             raise
         if isinstance(error, OSError) and not is_of_hydra:
             text += ": give another folder with hydra.run.dir="
-        elif not any(each in text for each in typed):
+        elif not isinstance(error, MissingConfigException) and not any(x in text for x in typed):
             text = f"{shlex.join(typed)}: {text}"
         raise UsageError(text) from error
 
