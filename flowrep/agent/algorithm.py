@@ -417,12 +417,12 @@ def as_cuda_graph(step: Step, device: torch.device) -> Step:
     """
     if device.type != "cuda":
         return step
-    return of_one_shape(
+    return with_fixed_layout(
         CudaGraphModule(step, warmup=WARM_UP, in_keys=[], out_keys=[], device=device)
     )
 
 
-def of_one_shape(step: Step) -> Step:
+def with_fixed_layout(step: Step) -> Step:
     """Returns `step` with a check that each batch has the layout of the first one.
 
     A graph copies each batch into the memory of the first one. Without the check, a batch of one

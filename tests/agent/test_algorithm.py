@@ -12,7 +12,7 @@ from torchrl.data import Categorical, OneHot
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from flowrep.agent import load_checkpoint, save_checkpoint, torch_threads
-from flowrep.agent.algorithm import DivergenceError, DivergenceWatch, of_one_shape
+from flowrep.agent.algorithm import DivergenceError, DivergenceWatch, with_fixed_layout
 from tests.running import run_python
 
 ENVS = 5
@@ -204,7 +204,7 @@ def test_the_error_names_the_first_update_that_diverged_and_its_metrics():
 
 
 def test_a_batch_of_another_layout_is_refused_with_the_key_that_differs():
-    step = of_one_shape(lambda batch: batch)
+    step = with_fixed_layout(lambda batch: batch)
     first = TensorDict({"seen": torch.zeros(4, 2), "next": {"reward": torch.zeros(4, 1)}}, [4])
     assert step(first) is first
     step(first.clone().update({"td_error": torch.zeros(4)}))

@@ -9,7 +9,6 @@ from tensordict import TensorDict
 from torchrl.data import Composite, Unbounded
 
 from flowrep.agent import DiscreteSAC, DiscreteSACWithValue
-from tests.agent.plain import encode, head
 
 
 def test_losses_in_bfloat16_are_near_those_in_float32(make_agent, random_steps, as_batch):
@@ -52,6 +51,27 @@ def test_dsac_learns_to_walk_to_the_end_of_a_corridor(make_agent, as_batch):
 
 
 LR, ALPHA, GAMMA, TAU, TARGET_ENTROPY = 3e-4, 0.5, 0.99, 0.005, 0.2 * math.log(3)
+
+
+def encode(weights, prefix, maps):
+    """Nature encoders in plain PyTorch, whose weights' names begin with `prefix`."""
+    embeddings = []
+    for i, x in enumerate(maps):
+        w = {k.removeprefix(f"{prefix}.encoders.{i}."): v for k, v in weights.items()}
+        x = F.leaky_relu(F.conv2d(x, w["conv1.weight"], w["conv1.bias"], 4))
+        x = F.leaky_relu(F.conv2d(x, w["conv2.weight"], w["conv2.bias"], 2))
+        x = F.leaky_relu(F.conv2d(x, w["conv3.weight"], w["conv3.bias"]))
+        x = x.permute(0, 2, 3, 1).flatten(1)
+        embeddings.append(F.leaky_relu(F.linear(x, w["linear.weight"], w["linear.bias"])))
+    return torch.cat(embeddings, 1)
+
+
+def head(weights, prefix, x, net=...):
+    """A linear layer, SiLU and a linear layer; of the stacked head `net`."""
+    w = {k: weights[f"{prefix}.{k}"][net] for k in
+         ("hidden.weight", "hidden.bias", "output.weight", "output.bias")}  # fmt: skip
+    x = F.linear(x, w["hidden.weight"], w["hidden.bias"])
+    return F.linear(x * torch.sigmoid(x), w["output.weight"], w["output.bias"])
 
 
 def dsac_losses(weights, maps, next_maps, action, reward, terminated):
