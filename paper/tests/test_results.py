@@ -376,6 +376,17 @@ def test_the_page_says_what_the_stored_runs_say(packed):
     assert all((results.PAGE.parent / figure).is_file() for figure in figures)
 
 
+@pytest.mark.slow
+def test_the_page_begins_with_runs_of_the_papers_length_once_there_are_any(packed):
+    long = [
+        replace(r, name=f"two_million_{r.name[7:]}") for r in packed if r.name[:10] == "laptop_str"
+    ]
+    text, figures = results.render(DECLARED, [*packed, *long])
+    assert results.LENGTH_FIGURE in figures
+    assert text.index(results.LENGTH_FIGURE) < text.index("\n## ")
+    assert "|two million frames|" in text
+
+
 @pytest.fixture(scope="module")
 def stored(packed):
     return studies_of(DECLARED, packed)
