@@ -234,58 +234,31 @@ def write_zed(folder: Path) -> list[Moment]:
 
 KITTI_K = np.array([[31.0, 0.0, 18.5], [0.0, 31.0, 13.0], [0.0, 0.0, 1.0]])
 KITTI_BASELINE_M = 0.5
-KITTI_CAM_FROM_VELO = rigid((1.5, -1.6, 0.1), (0.01, -0.07, -0.3)).numpy()
-KITTI_VELO_FROM_IMU = rigid((0.01, 0.0, 0.02), (-0.8, 0.3, -0.8)).numpy()
-EARTH_M = 6378137.0
-
-
-def kitti_pose(moment: int) -> tuple[np.ndarray, list[float]]:
-    """Returns world_from_imu and the packet that says so, around 49 degrees north."""
-    latitude, longitude, altitude = 49.0 + 4e-6 * moment, 8.4 + 9e-6 * moment, 115 + 0.02 * moment
-    roll, pitch, yaw = 0.02, -0.01 + 0.003 * moment, 0.9 + 0.01 * moment
-    scale = np.cos(np.radians(49.0)) * EARTH_M
-    north = scale * np.log(np.tan(np.radians((90 + latitude) / 2)))
-    pose = rigid((roll, pitch, yaw), (scale * np.radians(longitude), north, altitude)).numpy()
-    return pose, [latitude, longitude, altitude, roll, pitch, yaw, *[0.0] * 24]
 
 
 def write_kitti(folder: Path) -> list[Moment]:
     """One pair; its two moments in the order they are read in, the later picture first."""
-    training, raw = folder / "training", folder / "raw"
-    imu_from_cam = np.linalg.inv(KITTI_CAM_FROM_VELO @ KITTI_VELO_FROM_IMU)
-    imu_from_cam[:3, 3] += imu_from_cam[:3, :3] @ [-0.06, 0.0, 0.0]  # the colour camera's offset
-    poses = [kitti_pose(i)[0] @ imu_from_cam for i in range(2)]
     random = np.random.default_rng(4)
     rgb = random.integers(0, 256, (2, HEIGHT, WIDTH, 3), dtype=np.uint8)
     disparity = random.integers(300, 900, (HEIGHT, WIDTH)).astype(np.uint16)
     disparity[0, :3] = 0
     measured = np.where(disparity == 0, np.nan, disparity / 256)
     depth = (31.0 * KITTI_BASELINE_M / measured).astype(np.float32)
-    motion = relative_motion(torch.from_numpy(poses[1]), torch.from_numpy(poses[0]))
+    motion = relative_motion(*map(torch.from_numpy, (pose(1), pose(0))))
     raw_flow, obj = flow_of(depth, KITTI_K, motion, body=True)
     for i, name in enumerate(("10", "11")):
-        put(training / f"image_2/000000_{name}.png", rgb[i])
-    put(training / "disp_occ_0/000000_10.png", disparity)
+        put(folder / f"image_2/000000_{name}.png", rgb[i])
+    put(folder / "disp_occ_0/000000_10.png", disparity)
     u, v = np.rint(-raw_flow * 64) + 2**15
-    put(training / "flow_occ/000000_10.png", np.stack([u, v, u * 0 + 1], -1).astype(np.uint16))
+    put(folder / "flow_occ/000000_10.png", np.stack([u, v, u * 0 + 1], -1).astype(np.uint16))
     projection = np.hstack([KITTI_K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], np.zeros((3, 1))])
     left, right = projection.copy(), projection.copy()
     left[0, 3], right[0, 3] = 31.0 * 0.06, 31.0 * (0.06 - KITTI_BASELINE_M)
-    lines = ["calib_time: 09-Jan-2012 13:57:47", f"R_rect_00: {numbers(np.eye(3))}"]
-    lines += [f"P_rect_02: {numbers(left)}", f"P_rect_03: {numbers(right)}"]
-    put(training / "calib_cam_to_cam/000000.txt", lines)
-    for kind, transform in (
-        ("velo_to_cam", KITTI_CAM_FROM_VELO), ("imu_to_velo", KITTI_VELO_FROM_IMU)
-    ):  # fmt: skip
-        rows = [f"R: {numbers(transform[:3, :3])}", f"T: {numbers(transform[:3, 3])}"]
-        put(training / f"calib_{kind}/000000.txt", rows)
-    drive = "2011_09_26/2011_09_26_drive_0005_sync"
-    put(folder / "train_mapping.txt", [drive.replace("/", " ") + " 0000000059"])
-    for i in range(2):
-        put(raw / f"{drive}/oxts/data/{59 + i:010d}.txt", [numbers(kitti_pose(i)[1])])
+    lines = ["calib_time: 09-Jan-2012 13:57:47", f"P_rect_02: {numbers(left)}"]
+    put(folder / "calib_cam_to_cam/000000.txt", [*lines, f"P_rect_03: {numbers(right)}"])
     nothing = np.zeros_like(obj)
-    later = Moment(rgb[1], np.full_like(depth, np.nan), poses[1], nothing, nothing)
-    return [later, Moment(rgb[0], depth, poses[0], raw_flow, obj)]
+    later = Moment(rgb[1], np.full_like(depth, np.nan), pose(1), nothing, nothing)
+    return [later, Moment(rgb[0], depth, pose(0), raw_flow, obj)]
 
 
 OPENCV_K = K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]

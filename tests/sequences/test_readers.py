@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -11,27 +12,13 @@ pytest.importorskip("cv2", reason="recordings need OpenCV")
 
 import cv2
 
-from flowrep.sequences import SequenceError, factorize_frames, open_recording, recorded_flow
+from flowrep.sequences import factorize_frames, open_recording, recorded_flow
 from tests.sequences import synthetic
 from tests.sequences.synthetic import HEIGHT, OPENCV_INTRINSICS, WIDTH
 
 
 def opener(name, **options):
     return partial(open_recording, format=name, **options)
-
-
-def open_kitti(folder):
-    files = {"raw_data": folder / "raw", "mapping": folder / "train_mapping.txt"}
-    return open_recording(folder / "training", "kitti", **files)
-
-
-def test_kitti_needs_both_files_for_poses(tmp_path):
-    synthetic.write_kitti(tmp_path)
-    training = tmp_path / "training"
-    with pytest.raises(SequenceError, match=r"format\.raw_data"):
-        open_recording(training, "kitti", mapping=tmp_path / "train_mapping.txt")
-    with pytest.raises(SequenceError, match=r"format\.mapping"):
-        open_recording(training, "kitti", raw_data=tmp_path / "raw")
 
 
 CAMERA = (31.0, 27.0, 18.5, 13.0)
@@ -51,7 +38,7 @@ FORMATS = {
     "vkitti2": (synthetic.write_vkitti2, opener("vkitti2"), True, False, (WIDTH - 1) / 65535),
     "sintel": (synthetic.write_sintel, open_sintel, True, True, 0),
     "tartanair": (synthetic.write_tartanair, opener("tartanair", backwards=True), True, True, 0),
-    "kitti": (synthetic.write_kitti, open_kitti, True, False, 0.5 / 64),
+    "kitti": (synthetic.write_kitti, opener("kitti"), True, False, 0.5 / 64),
     "zed": (synthetic.write_zed, opener("zed"), False, False, 0),
 }
 DECLARED = {
@@ -92,8 +79,10 @@ def test_what_was_written_is_read_and_object_flow_equals_the_truth(name, tmp_pat
         # unit, as float32.
         bits = 1e-6 if name in ("sevenscenes", "kubric") else 0
         np.testing.assert_allclose(frame.depth, moment.depth, rtol=bits)
-        assert frame.world_from_cam.dtype == np.float64
-        if name != "icl_nuim":  # whose world is mirrored
+        if name == "kitti":
+            assert frame.world_from_cam is None
+        elif name != "icl_nuim":  # whose world is mirrored
+            assert frame.world_from_cam.dtype == np.float64
             np.testing.assert_allclose(
                 frame.world_from_cam, moment.world_from_cam, rtol=0, atol=1e-8
             )
@@ -102,7 +91,9 @@ def test_what_was_written_is_read_and_object_flow_equals_the_truth(name, tmp_pat
     assert len({frame.name for frame in recording}) == len(recording)
     truth = iter(ordered[1:])
     source = recorded_flow if has_flow else lambda previous, current: next(truth).raw
-    first, *others = factorize_frames(recording, source)
+    posed = zip(recording, ordered)
+    frames = [replace(frame, world_from_cam=m.world_from_cam) for frame, m in posed]
+    first, *others = factorize_frames(frames if name == "kitti" else recording, source)
     assert first is None
     for made, moment in zip(others, ordered[1:], strict=True):
         known = np.isfinite(moment.depth)
@@ -144,19 +135,6 @@ def test_what_the_data_set_masks_is_unknown(name, tmp_path):
     raw = open_it(tmp_path)[2].raw
     assert np.isnan(raw[:, 4, 5]).all()
     assert np.isnan(raw).sum() == 2
-
-
-def test_a_kitti_pair_without_a_raw_recording_is_left_out(tmp_path):
-    synthetic.write_kitti(tmp_path)
-    picture = tmp_path / "training/image_2/000000_10.png"
-    (tmp_path / "training/image_2/000001_10.png").write_bytes(picture.read_bytes())
-    recording = open_kitti(tmp_path)
-    assert [frame.name for frame in recording] == ["000000_11", "000000_10"]
-    assert recording.notes == ("1 of 2 pairs have no raw recording, so no poses",)
-    without_poses = open_recording(tmp_path / "training", "kitti")
-    assert not without_poses.has_poses
-    assert without_poses[1].world_from_cam is None
-    np.testing.assert_array_equal(without_poses[1].depth, recording[1].depth)
 
 
 def test_zed_depth_beyond_its_range_is_missing(tmp_path):
