@@ -306,7 +306,7 @@ def test_without_poses_the_cameras_motion_is_estimated(moments, tmp_path, capsys
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused_by_name(key, value, moments, tmp_path):
-    with pytest.raises(UsageError, match=key.removeprefix("+").replace("flow.", "")):
+    with pytest.raises(ValueError, match=key.removeprefix("+").replace("flow.", "")):
         factorize(tmp_path, f"{key}={value}")
 
 
