@@ -83,7 +83,7 @@ def unproject(depth: Tensor, K: Tensor) -> Tensor:
 
 def centred_pixels(height: int, width: int, K: Tensor) -> tuple[Tensor, Tensor]:
     """Returns pixel centres relative to the principal point: x `[*B, 1, W]`, y `[*B, H, 1]`."""
-    cx, cy = K[..., 0, 2, None, None], K[..., 1, 2, None, None]
+    cx, cy = K[..., :2, 2:].split(1, -2)
     u = torch.arange(width, dtype=K.dtype, device=K.device) + 0.5
     v = torch.arange(height, dtype=K.dtype, device=K.device) + 0.5
     return u - cx, v.unsqueeze(-1) - cy

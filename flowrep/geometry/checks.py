@@ -40,6 +40,9 @@ def check_shape(
 
 def common_batch(**batches: torch.Size) -> torch.Size:
     """Returns the common leading batch of several arguments; ValueError lists each one's."""
+    first, *others = batches.values()
+    if all(batch == first for batch in others):
+        return first
     try:
         return torch.broadcast_shapes(*batches.values())
     except RuntimeError as error:

@@ -23,6 +23,7 @@ which an intermediate result could overflow in float32 (the worst case is 3e34, 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 
 import torch
@@ -38,13 +39,23 @@ LEAST_POSITIVE = 1e-8  # of depth in metres, and of dt
 Planes = tuple[Tensor, Tensor, Tensor]  # u, v, valid: [*B, H, W] each
 
 
+def widest(*dtypes: torch.dtype) -> torch.dtype:
+    """Returns the type that all types can be converted to."""
+    return functools.reduce(torch.promote_types, dict.fromkeys(dtypes))
+
+
+def as_type(tensor: Tensor, dtype: torch.dtype) -> Tensor:
+    """Returns a tensor of a type; without a call of PyTorch if it has it, for single frames."""
+    return tensor if tensor.dtype is dtype else tensor.to(dtype)
+
+
 def known_camera(K: Tensor, dt: float | Tensor) -> tuple[Tensor, float | Tensor, Tensor]:
     """Returns K and dt with invalid values replaced, and where they were valid, `[*B]`.
 
     A mask alone would not keep nan out of gradients.
     """
-    known = _within_bounds(K, (-2, -1)) & (K[..., 0, 0] != 0) & (K[..., 1, 1] != 0)
-    K = torch.where(known[..., None, None], K, torch.eye(3, dtype=K.dtype, device=K.device))
+    known = _within_bounds(K, (-2, -1)) & (K[..., :2, :2].diagonal(dim1=-2, dim2=-1) != 0).all(-1)
+    K = K.masked_fill(~known[..., None, None], 1.0)
     if isinstance(dt, Tensor):
         dt = dt.to(K.dtype)
         runs = dt.isfinite() & (dt >= LEAST_POSITIVE)
@@ -60,7 +71,7 @@ def _within_bounds(tensor: Tensor, dims: tuple[int, ...]) -> Tensor:
 def motion_coefficients(
     K: Tensor, prev_K: Tensor | None, prev_from_curr: Tensor, known: Tensor
 ) -> Tensor:
-    """Returns A (row by row) and e, `[*B, 12]`; without `prev_K` the previous K is the same.
+    """Returns A (column by column) and e, `[*B, 12]`; without `prev_K` the previous K is the same.
 
     If an input is unknown, the coefficients place every point behind the previous camera. No pixel
     is then valid, and pixels need no separate check.
@@ -69,36 +80,32 @@ def motion_coefficients(
     single one, and a static body's flow would then differ from the camera's.
     """
     bounded = _within_bounds(prev_from_curr, (-2, -1))
-    motion = torch.where(bounded[..., None, None], prev_from_curr, 0.0)
+    motion = prev_from_curr.masked_fill(~bounded[..., None, None], 0.0)[..., :3, :]
+    x, y, z = (motion - torch.eye(3, 4, dtype=motion.dtype, device=motion.device)).unbind(-2)
     fx, skew, fy = _focal(K)
-    d = [[motion[..., i, j] - float(i == j) for j in range(3)] for i in range(3)]  # R - I
-    t = [motion[..., i, 3] for i in range(3)]
     fx_p, skew_p, fy_p = (fx, skew, fy) if prev_K is None else _focal(prev_K)
-    columns = [[fx_p * x + skew_p * y, fy_p * y, z] for x, y, z in (*zip(*d), t)]  # M (R - I | T)
+    x, y = fx_p * x + skew_p * y, fy_p * y  # M (R - I | T), of which z is the third row
     if prev_K is not None:
-        change = prev_K - K
-        right, down = change[..., :2, 2].unbind(-1)
-        columns = [[x + right * z, y + down * z, z] for x, y, z in columns]
-        for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)):
-            columns[j][i] = columns[j][i] + change[..., i, j]
-    *rows, e = *zip(*columns[:3]), columns[3]
-    a = []
-    for in_x, in_y, constant in rows:  # ... K'^-1
-        a_x = in_x / fx
-        a += [a_x, (in_y - skew * a_x) / fy, constant]
-    coefficients = torch.stack(torch.broadcast_tensors(*a, *e), -1)
-    known = (known & bounded & _within_bounds(coefficients, (-1,))).unsqueeze(-1)
+        change = torch.nn.functional.pad(prev_K - K, (0, 1))
+        x, y = (row + change[..., i, 2:3] * z for i, row in enumerate((x, y)))
+        x, y = x + change[..., 0, :], y + change[..., 1, :]
+    in_x, in_y, constant, e = torch.stack(torch.broadcast_tensors(x, y, z), -2).unbind(-1)
+    a_x = in_x / fx  # ... K'^-1
+    a_y = (in_y - skew * a_x) / fy
+    coefficients = torch.cat([a_x, a_y, constant, e], -1)
+    unknown = ~(known & bounded & _within_bounds(coefficients, (-1,))).unsqueeze(-1)
     behind = (0.0, -2.0, 0.0)  # 1 + qz = -1
-    # Concatenated, so that inductor stores the twelve numbers. It would fuse a single `where` with
-    # the code that reads them and repeat it at every pixel, and `factorize` would take 1.4 to 1.7
-    # times as long.
-    parts = zip(coefficients.split([8, 1, 3], -1), behind)
-    return torch.cat([torch.where(known, part, otherwise) for part, otherwise in parts], -1)
+    # Concatenated, so that inductor stores the twelve numbers. It would fuse a single `masked_fill`
+    # with the code that reads them and repeat it at every pixel, and `factorize` would take 1.4 to
+    # 1.7 times as long.
+    parts = zip((coefficients[..., :8], coefficients[..., 8:9], coefficients[..., 9:]), behind)
+    return torch.cat([part.masked_fill(unknown, otherwise) for part, otherwise in parts], -1)
 
 
 def _focal(K: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns fx, skew and fy."""
-    return K[..., 0, 0], K[..., 0, 1], K[..., 1, 1]
+    """Returns fx, skew and fy, `[*B, 1]` each."""
+    first, second, _ = K.unbind(-2)
+    return first[..., :1], first[..., 1:2], second[..., 1:2]
 
 
 def flow_planes(
@@ -114,7 +121,7 @@ def flow_planes(
 
     Depth is `[*B, H, W]`; all other arguments broadcast with it.
     """
-    depth = depth.to(x.dtype)
+    depth = as_type(depth, x.dtype)
     has_depth = depth >= LEAST_POSITIVE  # nan compares False
     # The result is masked in any case. For gradients, the inputs of both divisions must be masked
     # as well, because the derivative of an unused branch is 0 · inf = nan. Eager code without
@@ -128,8 +135,8 @@ def flow_planes(
     per_z = (torch.where(in_front, z_ratio, 1.0) if is_masked else z_ratio).reciprocal()
     if isinstance(dt, Tensor) or dt != 1.0:
         per_z = per_z / dt
-    u = ((x * qz - qx) * per_z).to(dtype)
-    v = ((y * qz - qy) * per_z).to(dtype)
+    u = as_type((x * qz - qx) * per_z, dtype)
+    v = as_type((y * qz - qy) * per_z, dtype)
     valid = in_front
     # Computed in float32 or float64, but perhaps returned as float16, whose limit is 65,504.
     if torch.finfo(dtype).max < torch.finfo(x.dtype).max:
@@ -143,7 +150,8 @@ def stack_planes(u: Tensor, v: Tensor) -> Tensor:
     It concatenates the planes along the rows and splits the result. With torch.stack, inductor
     interleaves the channels, which takes 5 to 20 % longer.
     """
-    return torch.cat([u, v], -2).unflatten(-2, (2, -1))
+    *batch, height, width = u.shape
+    return torch.cat([u, v], -2).view(*batch, 2, height, width)
 
 
 def mask_channel(valid: Tensor) -> Tensor:

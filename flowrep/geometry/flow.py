@@ -13,7 +13,14 @@ from flowrep.extras import numba_is_installed
 from flowrep.geometry import closed_form
 from flowrep.geometry.camera import centred_pixels
 from flowrep.geometry.checks import check_name, check_rows, check_shape, common_batch
-from flowrep.geometry.closed_form import Planes, flow_planes, known_camera, motion_coefficients
+from flowrep.geometry.closed_form import (
+    Planes,
+    as_type,
+    flow_planes,
+    known_camera,
+    motion_coefficients,
+    widest,
+)
 
 Direction: TypeAlias = Literal["forward", "backward"]
 Grid: TypeAlias = Literal["current", "previous"]
@@ -171,27 +178,25 @@ def factorize(
     batch = _check(depth, K, prev_K, prev_from_curr, dt, raw=raw)
     # Ego flow is rounded as in `rigid_flow`, whatever raw's dtype, so that static obj is exactly 0.
     u, v, valid = _planes(batch, depth, None, K, prev_K, prev_from_curr.unsqueeze(-3), dt)
-    dtype = torch.promote_types(u.dtype, raw.dtype)
-    compute = torch.promote_types(u.dtype, torch.float32)
-    raw = raw.to(dtype).expand(*batch, -1, -1, -1)
+    dtype, compute = widest(u.dtype, raw.dtype), widest(u.dtype, torch.float32)
+    raw = as_type(raw, dtype).expand(*batch, -1, -1, -1)
     if _suits_numba(depth, u, v, raw):
         from flowrep.geometry import numba_flow  # needs numba
 
         obj, known = numba_flow.object_flow(raw, u, v, valid)
         return Factors(closed_form.stack_planes(u, v), obj, closed_form.mask_channel(known))
     raw_u, raw_v = raw.unbind(-3)
-    u, v = u.to(dtype), v.to(dtype)
+    u, v = as_type(u, dtype), as_type(v, dtype)
     obj_u, obj_v = raw_u - u, raw_v - v
     # Finite, and small enough for a finite difference.
     largest = closed_form.largest_raw(compute)
-    measured = raw_u.to(compute).abs() + raw_v.to(compute).abs() < largest
+    measured = as_type(raw_u, compute).abs() + as_type(raw_v, compute).abs() < largest
     if torch.finfo(dtype).max < torch.finfo(compute).max:
         measured = measured & obj_u.isfinite() & obj_v.isfinite()
     known = valid & measured
     # When compiled, apply the two masks in turn. Inductor would write their conjunction to memory,
     # as bools one lane at a time, and take ten times as long.
-    masks = [measured, valid] if torch.compiler.is_compiling() else [known]
-    for mask in masks:
+    for mask in [measured, valid] if torch.compiler.is_compiling() else [known]:
         obj_u, obj_v = torch.where(mask, obj_u, 0.0), torch.where(mask, obj_v, 0.0)
     ego, obj = closed_form.stack_planes(u, v), closed_form.stack_planes(obj_u, obj_v)
     return Factors(ego, obj, closed_form.mask_channel(known))
@@ -290,16 +295,14 @@ def _planes(
     Without ids, all pixels have the first motion.
     """
     height, width = depth.shape[-2:]
-    dtype = torch.promote_types(torch.promote_types(depth.dtype, K.dtype), motions.dtype)
+    dtype = widest(*(x.dtype for x in (depth, K, prev_K, motions) if x is not None))
+    compute = widest(dtype, torch.float32)
+    K, dt, known = known_camera(as_type(K, compute), dt)
     if prev_K is not None:
-        dtype = torch.promote_types(dtype, prev_K.dtype)
-    compute = torch.promote_types(dtype, torch.float32)
-    K, dt, known = known_camera(K.to(compute), dt)
-    if prev_K is not None:
-        prev_K, _, prev_known = known_camera(prev_K.to(compute), 1.0)
+        prev_K, _, prev_known = known_camera(as_type(prev_K, compute), 1.0)
         prev_K, known = prev_K.unsqueeze(-3), known & prev_known
     by_motion = motion_coefficients(
-        K.unsqueeze(-3), prev_K, motions.to(compute), known.unsqueeze(-1)
+        K.unsqueeze(-3), prev_K, as_type(motions, compute), known.unsqueeze(-1)
     )  # [*B, N, 12]
     x, y = centred_pixels(height, width, K)
     depth = depth.squeeze(-3).expand(*batch, -1, -1)
@@ -310,13 +313,15 @@ def _planes(
 
         return numba_flow.planes_of_motions(depth, instance, by_motion, x, y, dt)
     if instance is None:
-        each = list(by_motion.unsqueeze(-2).unbind(-1))  # [*B, 1, 1]
+        each = by_motion.unsqueeze(-2).unbind(-1)  # [*B, 1, 1]
     else:
         each = _of_pixels(by_motion, instance)
-    axx, axy, ax, ayx, ayy, ay, azx, azy, az, *e = each
+    e = each[9:]
     # q at infinity is A x~, which is affine in x and y: one term per column plus one per row.
-    columns, rows = [axx * x, ayx * x, azx * x], [axy * y + ax, ayy * y + ay, azy * y + az]
-    if instance is None:  # each term has W or H values instead of H · W
+    columns = [a_x * x for a_x in each[:3]]
+    rows = [a_y * y + constant for a_y, constant in zip(each[3:6], each[6:9])]
+    # Without ids, each term has W or H values instead of H · W.
+    if instance is None and torch.compiler.is_compiling():
         x, *columns = _table(x, *columns)
         y, *rows = _table(y, *rows)
     q_far = [column + row for column, row in zip(columns, rows)]
@@ -325,14 +330,14 @@ def _planes(
     return flow_planes(depth, x, y, q_far, e, dt, dtype)
 
 
-def _of_pixels(by_motion: Tensor, instance: Tensor) -> list[Tensor]:
+def _of_pixels(by_motion: Tensor, instance: Tensor) -> tuple[Tensor, ...]:
     """Returns the twelve coefficients `[*B, H, W]` of each pixel's motion."""
-    row_of_pixel = instance.long().flatten(-2)
+    size = instance.shape[-2:]
+    row_of_pixel = instance.long().flatten(-2).unsqueeze(-2)
     try:
-        return [
-            rows.expand(*instance.shape[:-2], -1).gather(-1, row_of_pixel).view(instance.shape)
-            for rows in by_motion.unbind(-1)
-        ]
+        batch = row_of_pixel.shape[:-2]
+        rows, at = by_motion.mT.expand(*batch, -1, -1), row_of_pixel.expand(*batch, 12, -1)
+        return rows.gather(-1, at).view(*batch, 12, *size).unbind(-3)
     except RuntimeError:
         check_rows(int(instance.min()), int(instance.max()), by_motion.shape[-2])
         raise

@@ -119,10 +119,10 @@ def _fill(depth, ids, coefficients, xs, ys, dts, u, v, valid):
         near = (c[9], c[10], c[11])
         for i in range(height):
             y = ys[n, i]
-            row = (c[1] * y + c[2], c[4] * y + c[5], c[7] * y + c[8])
+            row = (c[3] * y + c[6], c[4] * y + c[7], c[5] * y + c[8])
             for j in range(width):
                 x = xs[n, j]
-                far = (c[0] * x + row[0], c[3] * x + row[1], c[6] * x + row[2])
+                far = (c[0] * x + row[0], c[1] * x + row[1], c[2] * x + row[2])
                 u[n, i, j], v[n, i, j], valid[n, i, j] = _flow(
                     depth[n, i, j], x, y, far, near, dts[n]
                 )
@@ -140,9 +140,9 @@ def _fill(depth, ids, coefficients, xs, ys, dts, u, v, valid):
                     continue  # the caller refuses such ids
                 x, c = xs[n, j], coefficients[n, number]
                 far = (
-                    c[0] * x + (c[1] * y + c[2]),
-                    c[3] * x + (c[4] * y + c[5]),
-                    c[6] * x + (c[7] * y + c[8]),
+                    c[0] * x + (c[3] * y + c[6]),
+                    c[1] * x + (c[4] * y + c[7]),
+                    c[2] * x + (c[5] * y + c[8]),
                 )
                 u[n, i, j], v[n, i, j], valid[n, i, j] = _flow(
                     depth[n, i, j], x, y, far, (c[9], c[10], c[11]), dts[n]

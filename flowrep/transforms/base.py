@@ -47,6 +47,8 @@ class Reads(NamedTuple):
 
 CALLS_PER_LOOK = 100  # on a GPU, one call of this many checks values: each check waits for them
 
+_UNSIGNED = (torch.uint16, torch.uint32, torch.uint64)
+
 DEPTH = Reads((1, "H", "W"), "float")
 IDS = Reads((1, "H", "W"), "integer")
 FLOW = Reads((2, "H", "W"), "float", spans_step=True)
@@ -154,7 +156,9 @@ class MapTransform(Transform):
 
     def _with_signed_ids(self, maps: Sequence[Tensor]) -> list[Tensor]:
         kinds = (reads.kind for reads in self.reads)
-        return [x.to(signed(x.dtype)) if k == "integer" else x for x, k in zip(maps, kinds)]
+        return [
+            x.long() if k == "integer" and x.dtype in _UNSIGNED else x for x, k in zip(maps, kinds)
+        ]
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         lacks = (next_tensordict.get(key, None) is None for key in self.in_keys)
@@ -177,7 +181,10 @@ class MapTransform(Transform):
                 f"{self.out_keys}; got {type(outputs).__name__}"
             )
         for key, value in zip(self.out_keys, outputs):
-            into[key] = value
+            into.set(key, value)
+
+    def _check_values(self, tensordict: TensorDictBase) -> None:
+        """Raises ValueError for values at a batch's root that can't be right: a subclass may."""
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -207,6 +214,7 @@ class MapTransform(Transform):
         `"next"` is left unchanged if it holds none of the inputs, for example in a buffer that
         stores only the reward there.
         """
+        self._check_values(tensordict)
         tensordict = self._call(tensordict)
         following = tensordict.get("next", None)
         if following is not None and any(key in following.keys(True) for key in self.in_keys):
@@ -468,7 +476,7 @@ def check_unconverted(key: NestedKey, before: Tensor, now: Tensor) -> None:
 
 def signed(dtype: torch.dtype) -> torch.dtype:
     """Returns int64 for the unsigned types for which PyTorch lacks most functions."""
-    return torch.int64 if dtype in (torch.uint16, torch.uint32, torch.uint64) else dtype
+    return torch.int64 if dtype in _UNSIGNED else dtype
 
 
 def _is_kind(dtype: torch.dtype, kind: str) -> bool:

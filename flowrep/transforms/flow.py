@@ -11,13 +11,13 @@ from typing import Any, TypeAlias
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 
 from flowrep import geometry
 from flowrep.geometry.checks import checked_number
+from flowrep.geometry.closed_form import as_type, widest
 from flowrep.transforms import base
 from flowrep.transforms.base import (
     Keys,
@@ -104,10 +104,11 @@ class CameraTransform(MapTransform):
             geometry.camera.check_size("intrinsics", self._rows, _map_size(maps, self.reads))
         return maps
 
-    def _check_cameras(self, tensordict: TensorDictBase, *, waits: bool = False) -> None:
+    def _check_values(self, tensordict: TensorDictBase, *, waits: bool = False) -> None:
         """Raises ValueError for a K under a key that can't be that of the maps."""
-        lacks = any(tensordict.get(key, None) is None for key in self.in_keys)
-        if not self.camera_keys or lacks or torch.compiler.is_compiling():
+        if not self.camera_keys or torch.compiler.is_compiling():
+            return
+        if any(tensordict.get(key, None) is None for key in self.in_keys):
             return
         maps = self._inputs(tensordict)
         for key, K in zip(self.camera_keys, maps[-len(self.camera_keys) :]):
@@ -120,16 +121,10 @@ class CameraTransform(MapTransform):
     ) -> TensorDictBase:
         begins = tensordict.get("_reset", None)
         if begins is None:
-            self._check_cameras(tensordict_reset, waits=True)
+            self._check_values(tensordict_reset, waits=True)
         elif self.camera_keys and begins.device.type == "cpu":
-            self._check_cameras(tensordict_reset[flags_of_batch(begins, tensordict_reset)])
+            self._check_values(tensordict_reset[flags_of_batch(begins, tensordict_reset)])
         return super()._reset(tensordict, tensordict_reset)
-
-    @dispatch(source="in_keys", dest="out_keys", auto_batch_size=False)
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the outputs for a batch of any shape, at its root and under `"next"`."""
-        self._check_cameras(tensordict)
-        return super().forward(tensordict)
 
     def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
         maps = super()._read(tensordict)
@@ -186,9 +181,9 @@ class FlowTransform(CameraTransform):
         """Returns the inputs, K, and the previous K or None, in depth's type, at least float32."""
         # Raw and ego flow have to round alike, or obj is rounding noise on static pixels.
         (depth,) = (x for x, reads in zip(maps, self.reads) if reads == base.DEPTH)
-        dtype = torch.promote_types(depth.dtype, torch.float32)
+        dtype = widest(depth.dtype, torch.float32)
         maps = [*maps] if self.K is None else [*maps, self.K]
-        maps = [x.to(dtype) if x.is_floating_point() else x for x in maps]
+        maps = [as_type(x, dtype) if x.is_floating_point() else x for x in maps]
         # With two keys, K and the previous K are the last of the maps already.
         return maps if len(self.camera_keys) == 2 else [*maps, None]
 
@@ -427,7 +422,7 @@ def masked_flow(flow: Tensor, key: NestedKey, tensordict: TensorDictBase) -> Ten
             f"{list(shape)}; got {known.dtype} {list(known.shape)}: convert or rename it"
         )
     # As bytes, because inductor's CPU code can't compile a `where` on `RawFlow`'s view as bool.
-    return torch.where(known.to(torch.bool).view(torch.uint8) != 0, flow, math.nan)
+    return torch.where(as_type(known, torch.bool).view(torch.uint8) != 0, flow, math.nan)
 
 
 def mask_key(flow: NestedKey) -> NestedKey:

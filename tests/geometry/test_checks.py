@@ -48,10 +48,8 @@ TYPES = {
 OPTIONS = {
     "finite; got 0": lambda: g.ego_flow(Z, K, M, dt=0),
     "dt must be positive (current": lambda: g.factorize(RAW, Z, K, M, dt=torch.nan),
-    "['z', 'ray_length', 'z_buffer', 'reversed_z_buffer'], got 'zbuffer'": lambda: g.adapt_depth(
-        Z, "zbuffer"
-    ),
-    "'ray_length' needs K": lambda: g.adapt_depth(Z, "ray_length"),
+    "'reversed_z_buffer'], got 'zbuffer'": lambda: g.adapt_depth(Z, "zbuffer"),
+    "need K": lambda: g.adapt_depth(Z, "ray_length"),
     "other kinds do not read it; kind is 'z'": lambda: g.adapt_depth(Z, "z", K=K),
     "need near_m and far_m": lambda: g.adapt_depth(Z, "z_buffer", near_m=1.0),
     "do not read them; kind is 'z'": lambda: g.adapt_depth(Z, "z", far_m=1.0),
