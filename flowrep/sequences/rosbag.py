@@ -150,7 +150,7 @@ class RosBag(Recording):
             if frames.any():
                 notes.append(f"{frames.sum()} of {len(kept)} frames are left out, {why}")
         if not kept.any():
-            remedy = "none is left: raise format.tolerance_s"
+            remedy = "none is left: raise format.tolerance_s, or give another format.world"
             raise SequenceError(self.path, f"{'; '.join(notes)}; {remedy}")
         places = positions(times_s)
         self._moments = [
