@@ -1,4 +1,4 @@
-"""The commands' configs: their files, their schema (`schema`) and their command lines (`cli`)."""
+"""How a command line and the files of conf/ become a config, and what a mistake in it is told."""
 
 from flowrep.config.yaml_file import CONF_DIR
 
@@ -11,6 +11,5 @@ def group_choices(group: str) -> list[str]:
 
 
 def config_groups() -> list[str]:
-    """Returns the names of flowrep's config groups, sorted: the folders of conf/ except Hydra's."""
-    folders = (path for path in CONF_DIR.iterdir() if path.is_dir())
-    return sorted(path.name for path in folders if path.name not in ("hydra", "__pycache__"))
+    """Returns the names of the config groups, sorted: the folders of conf/ with YAML files."""
+    return sorted({path.parent.name for path in CONF_DIR.glob("*/*.yaml")})

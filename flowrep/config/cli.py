@@ -93,7 +93,8 @@ def _composing(typed: Sequence[str]) -> Iterator[None]:
         if isinstance(error, OSError) and not is_of_hydra:
             text += ": give another folder with hydra.run.dir="
         elif not isinstance(error, MissingConfigException) and not any(x in text for x in typed):
-            text = f"{shlex.join(typed)}: {text}"
+            remedy = "" if is_of_hydra else "; a choice is a name or a list of names"
+            text = f"{shlex.join(typed)}: {text}{remedy}"
         raise UsageError(text) from error
 
 

@@ -58,7 +58,7 @@ def _load(source: ConfigSource, load: Any, config_path: str) -> ConfigResult:
         # What is unchanged in a copy of conf/ is flowrep's.
         if content != ours and (does := _outside(group, result.header["package"], content, ours)):
             raise UsageError(
-                f"{source.path}/{name} {does}; docs/configs.md has what a file of a folder may "
+                f"{source.path}/{name} {does}; docs/configs.md says what a file of your own may "
                 "set, all else is typed"
             )
     return result
