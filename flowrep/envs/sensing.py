@@ -9,7 +9,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from flowrep.scenes.pedestrians import PARTS, world_from_parts
-from flowrep.scenes.scene import num_classes
+from flowrep.scenes.scene import MOST_PX, num_classes
 from flowrep.simulator import camera
 from flowrep.simulator.bullet import Picture
 from flowrep.simulator.motion import instance_motion, planar, relative_motion, rigid_inverse
@@ -36,8 +36,12 @@ class Sensing:
     @classmethod
     def shared(cls, street: Street, sensors: Sequence[str], renderer: str, scale: int) -> "Sensing":
         """Returns the one that all envs of the process with these options share."""
-        if not hasattr(scale, "__index__") or scale < 1:
-            raise ValueError(f"picture_scale must be a whole number of at least 1, got {scale!r}")
+        config = street.layout.scene.camera
+        most = MOST_PX // max(config.height_px, config.width_px)
+        if not hasattr(scale, "__index__") or not 1 <= scale <= most:
+            raise ValueError(
+                f"picture_scale must be a whole number from 1 to {most}, got {scale!r}"
+            )
         names = (sensors,) if isinstance(sensors, str) else tuple(sensors)
         key = street, names, renderer, scale
         sensing = _SHARED.get(key)

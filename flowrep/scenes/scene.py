@@ -90,7 +90,8 @@ NotNegative = Annotated[float, Strict(), Field(ge=0.0)]
 Angle = Annotated[float, Strict(), Field(ge=-360.0, le=360.0)]
 HouseSide = Annotated[float, Strict(), Field(ge=1.0, le=MOST_M)]  # rows are filled house by house
 Count = Annotated[int, Strict(), Field(ge=1, le=1_000_000_000)]
-Pixels = Annotated[int, Strict(), Field(ge=1, le=4096)]  # 4K; more would exhaust memory
+MOST_PX = 4096  # 4K; more would exhaust memory
+Pixels = Annotated[int, Strict(), Field(ge=1, le=MOST_PX)]
 Whole = Annotated[int, Strict(), Field(ge=0)]
 Name = Annotated[str, StringConstraints(min_length=1)]
 FileName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]

@@ -18,7 +18,7 @@ def test_the_commands_know_every_baseline():
 
 @pytest.mark.slow_after_first
 @pytest.mark.parametrize("speed", ["low", "normal", "high"])
-def test_the_planner_arrives_and_habit_and_chance_seldom_do(drive, speed):
+def test_the_planner_succeeds_and_never_turning_and_random_actions_seldom_do(drive, speed):
     assert [e.outcome for e in drive("planner", 5, speed=speed)] == ["success"] * 5
     # With 60 episodes a true share of 12 % gives more than 15 in less than one run in 1,000.
     straight = [e.outcome for e in drive("never_turn", 60, speed=speed)]

@@ -189,7 +189,7 @@ def test_every_category_is_seen_on_a_drive(make_street, name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "speed"), zip(TURNING, ["low", "normal", "high"]))
-def test_the_planner_arrives_and_habit_and_chance_do_not(drive, name, speed):
+def test_the_planner_succeeds_where_never_turning_and_random_actions_fail(drive, name, speed):
     planned = [e.outcome for e in drive("planner", 2, name, speed=speed)]
     assert planned == ["success"] * 2
     # A bend ahead: straight on leads off the road or into somebody.

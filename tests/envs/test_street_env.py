@@ -255,6 +255,7 @@ def test_reset_options_set_speed_and_frame_rate_of_one_episode(make_street):
         ({"sensors": ("depth", "lidar")}, r"unknown sensors \['lidar'\].* depth, "),
         ({"renderer": "pybullet", "picture_scale": 2}, "picture_scale=2 needs"),
         ({"picture_scale": 1.5}, "picture_scale.* 1.5"),
+        ({"picture_scale": 49}, "picture_scale.* 1 to 48, got 49"),  # 49 · 84 px are more than 4K
         ({"picture_scale": "2"}, "picture_scale.* '2'"),
         ({"render_mode": "human"}, "render_mode is 'human'.*HumanRendering"),
     ],
