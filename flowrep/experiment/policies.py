@@ -93,6 +93,8 @@ class TrainedPolicy(NamedPolicy):
     """An agent that flowrep trained: its camera remains that of the training."""
 
     has_scene = True
+    precision: str | None = None
+    """The number format of its networks where none is given; None for that of the training."""
 
     def load(self, env: Mapping[str, Any], trusted: Collection[str], precision: Any) -> Loaded:
         """Returns the network with its weights, with `precision` in that number format."""
@@ -117,7 +119,8 @@ class TrainedPolicy(NamedPolicy):
                         f"scene '{given['scene'].name}': train one with scene.categories=all"
                     )
             given["scene"] = replace(given["scene"], **seen)
-        config = build.with_precision(trained.model_copy(update=given), precision)
+        config = trained.model_copy(update=given)
+        config = build.with_precision(config, precision or self.precision)
         with closing(build.env(config, num_envs=1, num_workers=0)) as street:
             policy = build.policy(config, street)
         try:
@@ -151,6 +154,9 @@ class RunPolicy(TrainedPolicy):
 
 class SavedPolicy(TrainedPolicy):
     """An agent in a file that `Agent.save` wrote; "pretrained" is flowrep's for the scene."""
+
+    # It may be on another machine now: a CPU that emulates bfloat16 takes ten times as long.
+    precision = "auto"
 
     def __init__(self, name: str) -> None:
         super().__init__(name)

@@ -271,6 +271,12 @@ def test_it_drives_where_one_that_never_turns_does_not(scene):
     assert sum(each.outcome == "success" for each in episodes) >= LEAST[scene]
 
 
+def test_a_saved_agent_computes_in_the_faster_format_of_this_machine(monkeypatch):
+    monkeypatch.setattr("flowrep.agent.observation.has_bf16", lambda device: False)
+    agent = Agent.load("pretrained", scene="straight_road", device="cpu")
+    assert agent.config.algorithm.precision == "fp32"  # it was trained in bf16
+
+
 def test_a_scene_with_changes_is_driven_with_the_camera_of_training():
     whole = Agent.load("pretrained", scene="straight_road", device="cpu").config.scene
     scene = replace(whole, time_limit_steps=7, camera=replace(whole.camera, height_px=84))
