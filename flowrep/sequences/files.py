@@ -208,17 +208,19 @@ def read_array(path: Path) -> NDArray[Any]:
     return array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
 
 
-def decoded(path: Path, data: bytes) -> NDArray[Any] | None:
-    """Returns the picture in a file's bytes, red first; None if there is none, or only a part."""
+def decoded(path: Path, data: bytes) -> NDArray[Any]:
+    """Returns the picture in a file's bytes, red first; ValueError for none or a part of one."""
     # Before version 5, OpenCV silently fills a truncated picture with grey, so look for the end
     # marker. Some cameras write a few bytes after it.
     end = {b"\x89P": b"IEND", b"\xff\xd8": b"\xff\xd9"}.get(data[:2], b"")
     if not data or end not in data[-4096:]:
-        return None
+        raise ValueError("it is no picture, or was cut off")
     with contextlib.suppress(UnidentifiedImageError):  # OpenCV reads more kinds, e.g. .pfm
         check_size(path, *Image.open(io.BytesIO(data)).size)
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if picture is None or picture.ndim == 2:
+    if picture is None:
+        raise ValueError("OpenCV can't decode it")
+    if picture.ndim == 2:
         return picture
     return picture[..., [2, 1, 0, 3][: picture.shape[2]]]
 

@@ -44,15 +44,6 @@ class _Edge(NamedTuple):
     poses: list[Pose]
 
 
-class _Moment(NamedTuple):
-    """A frame's stamps, ns, its pose, and its number if none were missing."""
-
-    stamp: int
-    depth_stamp: int
-    pose: Pose | None
-    position: int
-
-
 class RosBag(Recording):
     """A bag's colour pictures, each with its nearest depth map and its pose at its own time.
 
@@ -153,8 +144,9 @@ class RosBag(Recording):
             remedy = "none is left: raise format.tolerance_s, or give another format.world"
             raise SequenceError(self.path, f"{'; '.join(notes)}; {remedy}")
         places = positions(times_s)
+        # The stamps of a picture and its depth, its pose, its number if no frame were missing.
         self._moments = [
-            _Moment(stamps[i], depth_stamps[rows[i]], poses[i], int(places[i]))
+            (stamps[i], depth_stamps[rows[i]], poses[i], int(places[i]))
             for i in np.flatnonzero(kept)
         ]
         self.count, self.notes = len(self._moments), tuple(notes)
@@ -282,7 +274,7 @@ class RosBag(Recording):
         if len(bases) > 1:
             remedy = "record tf_static, or depth aligned to colour (aligned_depth_to_color)"
             raise SequenceError(self.path, f"depth is of {depth}, pictures of {colour}: {remedy}")
-        size = _colour(self._image(self._rgb, self._moments[0].stamp), self.path).shape[:2]
+        size = _colour(self._image(self._rgb, self._moments[0][0]), self.path).shape[:2]
         K_depth, _ = self._camera(None, self._depth)
         return Registration(K_depth, self.K, np.linalg.inv(ends[0]) @ ends[1], size)
 
@@ -312,17 +304,11 @@ def _plane(message: Any, dtype: str, channels: int) -> NDArray[Any]:
     return pixels.reshape(message.height, message.width, channels)
 
 
-def _decoded(message: Any, data: bytes, path: Path) -> Any:
-    if (picture := decoded(path, data)) is None:
-        raise SequenceError(path, f"holds a picture ({message.format}) that can't be decoded")
-    return picture
-
-
 def _colour(message: Any, path: Path) -> NDArray[np.uint8]:
     if hasattr(message, "encoding"):
         channels, order = _COLOUR[message.encoding]
         return np.ascontiguousarray(_plane(message, "u1", channels)[..., order])
-    picture = _decoded(message, bytes(message.data), path)
+    picture = decoded(path, bytes(message.data))
     return picture[..., :3] if picture.ndim == 3 else np.stack(3 * [picture], -1)
 
 
@@ -332,7 +318,7 @@ def _metres(message: Any, path: Path) -> NDArray[np.float32]:
         stored: Any = _plane(message, _DEPTH[message.encoding], 1)[..., 0]
     else:  # compressed_depth_image_transport: 12 bytes, then a PNG
         data = bytes(message.data)
-        stored = _decoded(message, data[12:], path)
+        stored = decoded(path, data[12:])
         if message.format.startswith("32FC1"):  # a / depth + b
             _, a, b = struct.unpack_from("<iff", data)
             stored = np.where(stored == 0, np.nan, a / (stored - np.float32(b)))

@@ -40,7 +40,7 @@ def test_intrinsics_of_each_sample_may_lie_under_a_key():
 @pytest.mark.parametrize(
     ("make", "expected"),
     [
-        (lambda: T.AdaptDepth("ray_length"), "needs K"),
+        (lambda: T.AdaptDepth("ray_length"), "need K"),
         (lambda: T.AdaptDepth("z", out_keys="depth"), "reads and writes depth: a second pass"),
         (lambda: T.AdaptPose(axes="gl"), r"'unity'\], got 'gl'"),
         (lambda: T.AdaptFlow(direction="forward", grid="previous"), "swap the two pictures"),
