@@ -29,6 +29,7 @@ from omegaconf import DictConfig
 
 from flowrep.config import cli
 from flowrep.config.folders import OF_THE_MACHINE, register_resolvers, settings_of
+from flowrep.config.foreign import checked_files
 from flowrep.config.usage import UsageError
 from flowrep.config.yaml_file import read_yaml
 from flowrep.experiment.outcomes import is_finished, success_of
@@ -37,6 +38,9 @@ from flowrep.files import open_to_append
 from flowrep.progress import STOP_SIGNALS, StopRequest
 
 register_resolvers()  # for the paths in conf/run_folder.yaml, which a worker resolves too
+if multiprocessing.current_process().name != "MainProcess":  # a pool's worker composes its jobs
+    _CHECKED = checked_files()
+    _CHECKED.__enter__()
 
 LOG = "job.log"
 STOP = ".stop"

@@ -39,8 +39,6 @@ def smoke_run(tmp_path_factory):
     [
         ("train --help", 0),
         ("train total_frames=abc", 2),
-        ("train scene.layout_seed=x", 2),
-        ("train sed=1", 2),
         ("evaluate --help", 0),
         ("evaluate episodes=0", 2),
         ("factorize --help", 0),

@@ -76,21 +76,20 @@ def agent(config: TrainConfig, env: EnvBase) -> Algorithm:
     images = {}
     if getattr(options, "mirror", False):
         images["mirror_image"] = make_mirror(env.base_env.scene, config.representations)
-    return maker(*_specs(config, env), options, **_run(config), **images)
+    specs, run = _task(config, env)
+    return maker(*specs, options, **run, **images)
 
 
 def policy(config: TrainConfig, env: EnvBase) -> Any:
     """Returns the config's policy, untrained, without the rest of the agent."""
     maker, options = algorithm(config.algorithm)
-    return maker.make_policy(*_specs(config, env), options, **_run(config))
+    specs, run = _task(config, env)
+    return maker.make_policy(*specs, options, **run)
 
 
-def _specs(config: EnvConfig, env: EnvBase) -> tuple[Any, Any, list[str]]:
-    return env.observation_spec, env.action_spec, list(config.representations)
-
-
-def _run(config: TrainConfig) -> dict[str, Any]:
-    return {"total_frames": config.total_frames, "device": device(config.device)}
+def _task(config: TrainConfig, env: EnvBase) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    specs = env.observation_spec, env.action_spec, list(config.representations)
+    return specs, {"total_frames": config.total_frames, "device": device(config.device)}
 
 
 def algorithm(section: AlgorithmOptions) -> tuple[Any, Any]:
