@@ -17,7 +17,6 @@ import flowrep
 from flowrep.config import CONF_DIR, cli, folders
 from flowrep.config.usage import UsageError
 from tests.config.conftest import SCHEMAS
-from tests.running import run_python
 
 MISTAKES = [
     # a choice that doesn't exist, or is none
@@ -329,16 +328,6 @@ def test_names_of_a_sweeps_runs_need_no_quotes_and_stay_apart():
     names = {folders.run_of_sweep(long), folders.run_of_sweep(other)}
     assert len(names) == 2
     assert all(name.startswith("s3_") and len(name) < 120 for name in names)
-
-
-@pytest.mark.slow
-def test_a_command_ends_with_one_line_and_code_2(tmp_path):
-    result = run_python("-m", "flowrep.evaluate", "run=nowhere", cwd=tmp_path)
-    assert result.returncode == 2, result.stderr
-    assert len(result.stderr.splitlines()) == 1, result.stderr
-    assert result.stderr.startswith("error: ")
-    assert "nowhere" in result.stderr
-    assert not (tmp_path / "nowhere").exists()
 
 
 @pytest.mark.parametrize("group", ["experiment", "debug"])

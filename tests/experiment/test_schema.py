@@ -63,6 +63,9 @@ def refusal(command, model, line):
         # what leaves nothing to learn
         "algorithm.learning_starts=4991 total_frames=5000",
         "algorithm.batch_size=31",
+        "algorithm.initial_epsilon=0.04 algorithm=dqn",  # which only falls, to 0.05
+        "algorithm.value_weight=0 algorithm=ppo",
+        "algorithm.replay_capacity=8 algorithm.n_steps=10 debug=smoke",
         "algorithm.rollout_length=64 algorithm=ppo total_frames=2047",
         "algorithm.replay_capacity=63 num_envs=32",
         "algorithm.batch_size=2049 algorithm=ppo",
@@ -186,16 +189,3 @@ def test_a_scene_that_is_none_is_refused_by_its_key(scene, says):
         validated(TrainConfig, plain("train") | {"scene": scene})
     assert str(caught.value).startswith(says)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("algorithm=dqn algorithm.initial_epsilon=0.04", "initial_epsilon=0.04 is less than"),
-        ("algorithm=ppo algorithm.value_weight=0", "algorithm.value_weight"),
-        ("algorithm.n_steps=10 algorithm.replay_capacity=8", "replay_capacity=8.*at least 44"),
-    ],
-)
-def test_options_with_which_an_agent_could_not_learn_are_refused(line, message):
-    with pytest.raises(UsageError, match=message):
-        validated(TrainConfig, plain("train", "debug=smoke", *line.split()))
