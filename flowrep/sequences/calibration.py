@@ -52,18 +52,15 @@ class Camera(pydantic.BaseModel):
         return [self.fx, self.fy, self.cx + shift, self.cy + shift]
 
 
-# COLMAP's cameras.txt, https://colmap.github.io/cameras.html: the numbers of each lens model.
+# COLMAP's lens models, https://colmap.github.io/cameras.html: their numbers by NeRF tools' names.
 _COLMAP = {
-    "SIMPLE_PINHOLE": "f cx cy", "PINHOLE": "fx fy cx cy", "SIMPLE_RADIAL": "f cx cy k1",
-    "RADIAL": "f cx cy k1 k2", "OPENCV": "fx fy cx cy k1 k2 p1 p2",
-    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", "SIMPLE_RADIALFISHEYE": "f cx cy k1",
-    "RADIALFISHEYE": "f cx cy k1 k2", "OPENCVFISHEYE": "fx fy cx cy k1 k2 k3 k4",
+    "SIMPLE_PINHOLE": "fl_x cx cy", "PINHOLE": "fl_x fl_y cx cy",
+    "SIMPLE_RADIAL": "fl_x cx cy k1", "RADIAL": "fl_x cx cy k1 k2",
+    "OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2",
+    "FULL_OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "SIMPLE_RADIAL_FISHEYE": "fl_x cx cy k1", "RADIAL_FISHEYE": "fl_x cx cy k1 k2",
+    "OPENCV_FISHEYE": "fl_x fl_y cx cy k1 k2 k3 k4",
 }  # fmt: skip
-# The names of the same numbers in files of ROS, OpenCV, Open3D and NeRF tools.
-_WIDTH, _HEIGHT = ("width", "image_width", "w"), ("height", "image_height", "h")
-_MATRIX = ("camera_matrix", "cameraMatrix", "intrinsic_matrix", "K", "k")
-_LENS = ("distortion_coefficients", "distortionCoefficients", "dist_coeffs", "D", "d")
-FISHEYE = ("equidistant", "fisheye", "OPENCVFISHEYE")
 FILES = (".json", ".yaml", ".yml", "cameras.txt")
 
 
@@ -104,43 +101,48 @@ def _colmap(path: Path) -> dict[str, Any]:
         raise SequenceError(path, f"holds {len(cameras)} cameras: {remedy}")
     _, model, width, height, *numbers = cameras[0]
     if model not in _COLMAP:
-        raise SequenceError(
-            path, f"has the lens {model}; of COLMAP's, read are {', '.join(_COLMAP)}"
-        )
-    named = dict(zip(_COLMAP[model].split(), map(float, numbers), strict=True))
-    lens = "OPENCVFISHEYE" if model.endswith("FISHEYE") else "OPENCV"
-    return {"w": int(width), "h": int(height), "fl_x": named.get("f"), "camera_model": lens} | named
+        raise SequenceError(path, f"has the lens {model}; read are {', '.join(_COLMAP)}")
+    named = zip(_COLMAP[model].split(), map(float, numbers), strict=True)
+    return {"w": int(width), "h": int(height), "camera_model": model, **dict(named)}
 
 
 def _renamed(given: dict[str, Any]) -> dict[str, Any]:
-    """Returns the numbers of another tool's file by this project's names."""
+    """Returns the numbers of another tool's file, of ROS, OpenCV, Open3D or NeRF, by our names."""
 
-    def of(names: Sequence[str]) -> Any:
+    def of(*names: str) -> Any:
         value = next((given[name] for name in names if given.get(name) is not None), None)
         return value.get("data") if isinstance(value, dict) else value
 
-    camera = {"width": of(_WIDTH), "height": of(_HEIGHT), "first_pixel_centre": 0.0}
-    if of(_MATRIX) is not None:
-        K = camera_matrix(of(_MATRIX), (1, 1), 0.5)
-        numbers, coefficients = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]], of(_LENS) or []
-    elif {"fl_x", "camera_angle_x"} & {*given}:  # of NeRF tools and COLMAP: centres at halves
+    camera = {"width": of("width", "image_width", "w"), "height": of("height", "image_height", "h")}
+    matrix = of("camera_matrix", "cameraMatrix", "intrinsic_matrix", "K", "k")
+    lens = lens_of(of("distortion_model", "camera_model"))
+    if matrix is not None:
+        K = camera_matrix(matrix, (1, 1), 0.5)
+        camera["first_pixel_centre"] = 0.0
+        numbers = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+        names = "distortion_coefficients", "distortionCoefficients", "dist_coeffs", "D", "d"
+        coefficients = of(*names) or []
+    elif {"fl_x", "camera_angle_x"} & {*given}:
         camera["first_pixel_centre"] = 0.5
         width, height = (size or math.nan for size in (camera["width"], camera["height"]))
-        fx = of(("fl_x", "fx")) or width / 2 / math.tan(given["camera_angle_x"] / 2)
+        fx = of("fl_x", "fx") or width / 2 / math.tan(given["camera_angle_x"] / 2)
         centre = given.get("cx", width / 2), given.get("cy", height / 2)
-        numbers = [fx, of(("fl_y", "fy")) or fx, *centre]
+        numbers = [fx, of("fl_y", "fy") or fx, *centre]
         order = ["k1", "k2", "k3", "k4"]
-        if given.get("camera_model") not in FISHEYE:
+        if lens == "opencv":
             order = ["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"][: 8 if "k4" in given else 5]
         coefficients = [given.get(name, 0.0) for name in order]
     else:
         return given
     camera |= dict(zip(("fx", "fy", "cx", "cy"), map(float, numbers)))
     if any(coefficients):
-        model = {given.get("distortion_model"), given.get("camera_model")}
-        camera |= {"distortion": list(map(float, coefficients))}
-        camera |= {"lens": "fisheye" if model & {*FISHEYE} else "opencv"}
+        camera |= {"distortion": list(map(float, coefficients)), "lens": lens}
     return camera
+
+
+def lens_of(model: str | None) -> Lens:
+    """Returns the lens that ROS, COLMAP or a NeRF tool calls by this name."""
+    return "fisheye" if re.search("fisheye|equidistant", str(model), re.IGNORECASE) else "opencv"
 
 
 def camera_matrix(

@@ -125,7 +125,7 @@ class DeclaredRecording(Recording):
         left_out["in format.leave_out"] = np.isin(self._names, list(self.leave_out))
         self._choose(left_out)
         self._made: dict[Any, tuple[Any, Any]] = {}
-        unit_m = self.depth_unit_m or files.usual_unit_m(self._depths[0], self.depth_coding)
+        unit_m = self.depth_unit_m or files.stored_depth(self._depths[0], self.depth_coding)[1]
         named = "pose_direction", "pose_axes", "depth_kind", "flow_direction", "flow_channels"
         self.conventions = {name: getattr(self, name) for name in named}
         self.conventions |= {"depth_unit_m": str(unit_m)}
@@ -225,21 +225,27 @@ class DeclaredRecording(Recording):
         keys: Any = None  # None: the rows are in the frames' order
         if "*" in pattern.partition(":")[0]:
             paths = [self._file(pattern, "numbers", name) for name in self._names]
-            each = [files.read_table(path).ravel() for path in paths]
+            each = [files.read_table(path)[0].ravel() for path in paths]
             for path, numbers in zip(paths, each):
                 if len(numbers) != len(each[0]):
                     raise SequenceError(path, f"has {len(numbers)} numbers, others {len(each[0])}")
             table = np.stack(each)
-        elif by == "name" and self.names is None:
-            keys, table = files.read_named_rows(path, self.key_column)
         else:
-            table = files.read_table(path)
+            in_rows = by == "name" and self.names is None
+            table, keys = files.read_table(path, self.key_column if in_rows else None)
             if self.rows_where is not None:
-                column, value = map(str, self.rows_where)
-                table = table[_column(path, table, int(column)) == float(self._path(value).name)]
-            if by == "name":
-                keys = files.read_names(self._path(self.names or ""))
-            elif by != "order":
+                try:
+                    column, value = map(str, self.rows_where)
+                    wanted = int(column), float(self._path(value).name)
+                except ValueError as error:
+                    says = f"is [column, number]: {error}"
+                    raise SequenceError("format.rows_where", says) from None
+                table = table[_column(path, table, wanted[0]) == wanted[1]]
+            if self.names is not None:
+                keys = np.array(files.read_json(self._path(self.names)), str).ravel()
+            elif by == "order":
+                keys = None
+            elif by != "name":
                 keys = _column(path, table, self.key_column)
         after_key = 0 if keys is None or by == "name" else self.key_column + 1
         first, end = columns or (after_key, table.shape[1])
@@ -315,8 +321,11 @@ class DeclaredRecording(Recording):
             numbers = self._numbers_in(given)
         camera_matrix(numbers[0], (2, 2), self.first_pixel_centre, source)  # or an error, early
         self._K_numbers = numbers.repeat(len(lacking) // len(numbers), axis=0)
-        depth = self.depth_intrinsics
-        self._depth_numbers = None if depth is None else self._numbers_in(depth)
+        depth, self._depth_numbers = self.depth_intrinsics, None
+        if depth is not None:
+            self._depth_numbers = self._numbers_in(depth)
+            K = camera_matrix(self._depth_numbers, (2, 2), self.first_pixel_centre)
+            geometry.check_intrinsics("format.depth_intrinsics", torch.from_numpy(K))
         shift = np.array(self.colour_from_depth or 3 * [0.0])
         if len(shift) == 3:
             shift = np.column_stack([np.eye(3), shift]).ravel()
@@ -326,8 +335,8 @@ class DeclaredRecording(Recording):
         return {"without intrinsics": lacking}
 
     def _numbers_in(self, given: str | Sequence[float]) -> Floats:
-        table = files.read_table(self._path(given)) if isinstance(given, str) else np.array(given)
-        return table.reshape(1, -1)
+        table = files.read_table(self._path(given))[0] if isinstance(given, str) else given
+        return np.array(table, np.float64).reshape(1, -1)
 
     def _choose(self, left_out: LeftOut) -> None:
         """Numbers the remaining frames, in the order in which they are read."""

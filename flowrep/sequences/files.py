@@ -37,6 +37,7 @@ _SUFFIXES = {
     "numbers": (".txt", ".csv", ".json", ".cam", ".pincam"),
 }
 FLO_TAG = 202021.25
+_NUMBER = re.compile(r"[-+]?(nan|inf|\.?\d[\d.]*(e[-+]?\d+)?)", re.IGNORECASE)
 UNREADABLE = (ValueError, LookupError, TypeError, ArithmeticError, RecursionError, struct.error)
 # More is no frame and no table, but a mistake or a bomb: a small file may ask for all memory.
 _MOST_BYTES, _MOST_PIXELS = 1 << 30, 100_000_000
@@ -108,40 +109,55 @@ def read_lines(path: Path) -> list[str]:
     return [line for line in lines if line and not line.startswith("#")]
 
 
-def read_table(path: Path) -> NDArray[np.float64]:
-    """Returns the numbers of a file, a row a line.
+def read_table(path: Path, names: int | None = None) -> tuple[NDArray[np.float64], list[str]]:
+    """Returns the numbers of a file, a row a line, and the rows' names in the column `names`.
 
-    They are separated by blanks or commas; a line that begins with a word is a header. Of JSON,
-    `path` ends in `file.json:key.key`, with `*` for each item of a list or value of an object; the
-    numbers of several keys, with `+` between them, stand side by side. Sintel's `.cam` is one row,
-    K and the extrinsics; a pose of Open3D's `.log` is four lines after one of other numbers.
+    They are separated by blanks or commas; a line that begins with a word is a header, and one
+    without a name in that column is skipped, as COLMAP's lines of points are. For JSON see
+    `read_json`: the numbers of several keys stand side by side. Sintel's `.cam` is one row, K and
+    the extrinsics; a pose of Open3D's `.log` is four lines after one of other numbers.
     """
-    name, _, keys = path.name.partition(":")
-    path = path.with_name(name)
+    suffix, rows = path.name.partition(":")[0].rpartition(".")[2].lower(), list[list[str]]()
     try:
-        if path.suffix.lower() == ".json":
-            whole = json.loads(regular(path).read_bytes())
-            parts = [np.array(_found(whole, k.split(".")), np.float64) for k in keys.split("+")]
+        if suffix == "json":
+            parts = [np.array(part, np.float64) for part in read_json(path)]
             table = np.hstack([p.reshape(len(p) if p.ndim > 1 else p.size, -1) for p in parts])
-        elif path.suffix.lower() == ".cam":
+        elif suffix == "cam":
             tag, *row = struct.unpack("<f21d", regular(path).read_bytes())
             table = np.array([row] if tag == FLO_TAG else [])
         else:
             lines = [line.replace(",", " ") for line in read_lines(path)]
-            if path.suffix.lower() == ".log":
+            if suffix == "log":
                 lines = [" ".join(lines[i + 1 : i + 5]) for i in range(0, len(lines), 5)]
-            if lines and not re.match(r"[-+.]?(\d|nan|inf)", lines[0], re.IGNORECASE):
+            if names is not None:
+                rows = [line.split() for line in lines]
+                rows = [x for x in rows if len(x) > names and not _NUMBER.fullmatch(x[names])]
+                lines = [" ".join(row[:names] + row[names + 1 :]) for row in rows]
+            elif lines and not _NUMBER.match(lines[0]):
                 del lines[0]
             table = np.loadtxt(lines, ndmin=2) if lines else np.empty(0)
     except UNREADABLE as error:
-        raise SequenceError(path, f"holds no table of numbers {keys}: {error!r}") from None
+        raise SequenceError(path, f"holds no table of numbers: {error!r}") from None
     if not table.size:
         raise SequenceError(path, "holds no numbers")
-    return table
+    return table, [row[names or 0] for row in rows]
+
+
+def read_json(path: Path) -> list[Any]:
+    """Returns what a JSON holds at each of the keys of a path `file.json:key.key+key`.
+
+    `*` is each item of a list or value of an object; at the end, an object's keys.
+    """
+    name, _, keys = path.name.partition(":")
+    path = path.with_name(name)
+    try:
+        whole = json.loads(regular(path).read_bytes())
+        return [_found(whole, key.split(".")) for key in keys.split("+")]
+    except UNREADABLE as error:
+        raise SequenceError(path, f"has nothing at {keys}: {error!r}") from None
 
 
 def _found(value: Any, steps: list[str]) -> Any:
-    """Returns what a JSON holds at a path; a last `*` gives an object's keys."""
     if not steps:
         return value
     step, *rest = steps
@@ -150,34 +166,6 @@ def _found(value: Any, steps: list[str]) -> Any:
     if step == "*":
         return [*value]
     return _found(value[int(step)] if isinstance(value, list) else value[step], rest)
-
-
-def read_names(path: Path) -> list[str]:
-    """Returns the texts of a JSON at a path, see `read_table`."""
-    name, _, keys = path.name.partition(":")
-    path = path.with_name(name)
-    try:
-        return [str(x) for x in _found(json.loads(regular(path).read_bytes()), keys.split("."))]
-    except UNREADABLE as error:
-        raise SequenceError(path, f"holds no list of names {keys}: {error!r}") from None
-
-
-def read_named_rows(path: Path, column: int) -> tuple[list[str], NDArray[np.float64]]:
-    """Returns the names in a column and the other numbers of each line.
-
-    A line without a name there is skipped, such as COLMAP's lines of points.
-    """
-    names, rows = [], []
-    for line in read_lines(path):
-        words = line.replace(",", " ").split()
-        if len(words) > column and not re.fullmatch(r"[-+.\deE]+|nan|inf", words[column]):
-            names.append(words.pop(column))
-            rows.append(words)
-    try:
-        return names, np.array(rows, dtype=np.float64).reshape(len(rows), -1)
-    except UNREADABLE as error:
-        says = f"holds no numbers beside names in column {column}: {error!r}"
-        raise SequenceError(path, says) from None
 
 
 def read_array(path: Path) -> NDArray[Any]:
@@ -281,38 +269,28 @@ def read_depth(
         coding: of colour pictures: `"float32_rgba"`, a float whose bytes are blue, green, red and
             alpha (TartanAir V2); `"rgb24"`, red + 256 green + 65536 blue (CARLA).
     """
-    stored = _without_coding(path, coding)
-    is_whole = stored.dtype.kind in "ui" and stored.itemsize > 1
-    if stored.ndim != 2 or not (is_whole or stored.dtype.kind == "f"):
-        given = f"holds {stored.dtype} {list(stored.shape)}"
-        wanted = "one channel of 16 bits or floats" if coding is None else f"depth_coding={coding}"
-        raise SequenceError(path, f"{given}, expected {wanted}")
-    unit_m = _usual_unit_m(stored) if unit_m is None else unit_m
-    depth = (stored * np.float64(unit_m)).astype(np.float32)
-    if is_whole:
+    stored, usual_m = stored_depth(path, coding)
+    depth = (stored * np.float64(usual_m if unit_m is None else unit_m)).astype(np.float32)
+    if stored.dtype.kind != "f":
         depth[np.isin(stored, list(missing))] = np.nan
         if no_surface is not None:
             depth[stored == no_surface] = np.inf
     return depth
 
 
-def usual_unit_m(path: Path, coding: DepthCoding | None = None) -> float:
-    """Returns the metres of a 1 that a file stores: 0.001 for whole numbers, 1 for floats."""
-    return _usual_unit_m(_without_coding(path, coding))
-
-
-def _usual_unit_m(stored: NDArray[Any]) -> float:
-    return 0.001 if stored.dtype.kind in "ui" else 1.0
-
-
-def _without_coding(path: Path, coding: DepthCoding | None) -> NDArray[Any]:
-    """Returns stored depth as one number a pixel."""
+def stored_depth(path: Path, coding: DepthCoding | None = None) -> tuple[NDArray[Any], float]:
+    """Returns the numbers `[H, W]` that a file stores, and the usual metres of a 1."""
     stored = read_array(path)
     if coding == "float32_rgba" and stored.dtype == np.uint8 and stored.shape[2:] == (4,):
         stored = np.ascontiguousarray(stored[..., [2, 1, 0, 3]]).view("<f4")[..., 0]
     elif coding == "rgb24" and stored.dtype == np.uint8 and stored.shape[2:] in ((3,), (4,)):
         stored = stored[..., :3].astype(np.uint32) @ np.array([1, 256, 65536], np.uint32)
-    return stored
+    is_whole = stored.dtype.kind in "ui" and stored.itemsize > 1
+    if stored.ndim != 2 or not (is_whole or stored.dtype.kind == "f"):
+        given = f"holds {stored.dtype} {list(stored.shape)}"
+        wanted = "one channel of 16 bits or floats" if coding is None else f"depth_coding={coding}"
+        raise SequenceError(path, f"{given}, expected {wanted}")
+    return stored, 0.001 if is_whole else 1.0
 
 
 def read_flow(path: Path, coding: FlowCoding = "kitti") -> FlowMap:
@@ -334,7 +312,7 @@ def read_flow(path: Path, coding: FlowCoding = "kitti") -> FlowMap:
         return flow
     if coding == "kubric":
         kind = path.stem.rpartition("_")[0]  # forward_flow, backward_flow
-        ranges = read_table(path.with_name(f"data_ranges.json:{kind}.min+{kind}.max"))
+        ranges, _ = read_table(path.with_name(f"data_ranges.json:{kind}.min+{kind}.max"))
         least, most = map(float, ranges[0])
         return flow * np.float32((most - least) / 65535) + np.float32(least)
     if coding == "vkitti2":

@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 
 from flowrep.extras import require
 from flowrep.sequences.calibration import (
-    FISHEYE,
-    Lens,
     Matrix,
     Registration,
     Undistortion,
     as_pose,
     camera_matrix,
+    lens_of,
 )
 from flowrep.sequences.declared import between, interpolated_pose, nearest, positions
 from flowrep.sequences.files import decoded, regular
@@ -124,12 +123,12 @@ class RosBag(Recording):
             lag_s = np.median((depth_times_s[rows] - times_s)[rows >= 0])
             notes.append(f"depth is {lag_s:+.4f} s from its picture, in the median")
         left_out = {f"without depth within {self.tolerance_s} s": rows < 0}
-        poses: list[Pose | None] = [None] * len(times_s)
+        poses: Any = [None] * len(times_s)
         edges = self._edges_above(frame, world)
         self.has_poses = any(not edge.is_static for edge in edges)
         if self.has_poses:
             poses, gap_s = self._poses(edges, times_s, start, fixed)
-            lacking = np.array([pose is None for pose in poses])
+            lacking = np.isnan(poses).any((1, 2))
             left_out[f"without transforms within {self.tolerance_s} s"] = lacking
             notes.append(f"poses are interpolated between transforms up to {gap_s:.3f} s apart")
         else:
@@ -211,8 +210,7 @@ class RosBag(Recording):
         matrix = camera_matrix(P if is_rectified else K, size, 0.0, source)
         if is_rectified or not np.any(D):
             return matrix, None
-        lens: Lens = "fisheye" if info.distortion_model in FISHEYE else "opencv"
-        return matrix, Undistortion(matrix, [*D], lens, size)
+        return matrix, Undistortion(matrix, [*D], lens_of(info.distortion_model), size)
 
     # Where the camera was.
 
@@ -242,24 +240,21 @@ class RosBag(Recording):
 
     def _poses(
         self, edges: list[_Edge], times_s: NDArray[np.float64], start: int, fixed: Pose
-    ) -> tuple[list[Pose | None], float]:
-        """Returns world_from_cam, None where it is unknown, and the longest gap bridged."""
-        poses: list[Pose | None] = [fixed] * len(times_s)
-        gap_s = 0.0
+    ) -> tuple[NDArray[np.float64], float]:
+        """Returns world_from_cam, nan where it is unknown, and the longest gap bridged."""
+        poses, gap_s = np.stack([fixed] * len(times_s)), 0.0
         for edge in edges:
             if edge.is_static:  # if it was sent again, the last counts
-                poses = [None if pose is None else edge.poses[-1] @ pose for pose in poses]
+                poses = edge.poses[-1] @ poses
                 continue
             order = np.argsort(edge.stamps, kind="stable")
             at_s = (np.array(edge.stamps)[order] - start) * 1e-9
             before, after, share = between(at_s, times_s, self.tolerance_s)
             gap_s = max(gap_s, float((at_s[after] - at_s[before])[before >= 0].max(initial=0.0)))
-            for i, pose in enumerate(poses):
-                if pose is not None and before[i] >= 0:
-                    ends = edge.poses[order[before[i]]], edge.poses[order[after[i]]]
-                    poses[i] = interpolated_pose(*ends, share[i]) @ pose
-                else:
-                    poses[i] = None
+            sent = np.array(edge.poses)[order]
+            moved = map(interpolated_pose, sent[before], sent[after], share)
+            poses = np.array([*moved]) @ poses
+            poses[before < 0] = np.nan
         return poses, gap_s
 
     def _registration(self, colour: str, depth: str) -> Registration:

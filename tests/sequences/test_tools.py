@@ -149,22 +149,26 @@ distortion_coefficients: !!opencv-matrix
 """
 COLMAP = f"1 OPENCV {WIDTH} {HEIGHT} 31 27 18.5 13 {numbers(LENS[:4])}"
 NERF = {"fl_x": 31, "fl_y": 27, "cx": 18.5, "cy": 13, "w": WIDTH, "h": HEIGHT}
-NERF |= dict(zip(("k1", "k2", "p1", "p2"), LENS))
+NERF_FISHEYE = {"camera_model": "OPENCV_FISHEYE", **dict(zip(("k1", "k2", "k3", "k4"), LENS))}
+BROWN, FISHEYE = {"distortion": LENS}, {"distortion": LENS[:4], "lens": "fisheye"}
 
 
 @pytest.mark.parametrize(
-    ("file", "text"),
+    ("file", "text", "lens"),
     [
-        ("ros.yaml", ROS),
-        ("opencv.yml", OPENCV),
-        ("cameras.txt", COLMAP),
-        ("t.json", json.dumps(NERF)),
+        ("ros.yaml", ROS, BROWN),
+        ("ros.yaml", ROS.replace("plumb_bob", "equidistant").replace(", 0.0]}", "]}"), FISHEYE),
+        ("opencv.yml", OPENCV, BROWN),
+        ("cameras.txt", COLMAP, BROWN),
+        ("cameras.txt", COLMAP.replace("OPENCV", "OPENCV_FISHEYE"), FISHEYE),
+        ("t.json", json.dumps(NERF | dict(zip(("k1", "k2", "p1", "p2"), LENS))), BROWN),
+        ("t.json", json.dumps(NERF | NERF_FISHEYE), FISHEYE),
     ],
-)  # fmt: skip
-def test_a_calibration_of_another_tool_is_that_camera_and_lens(file, text, tmp_path):
+)
+def test_a_calibration_of_another_tool_is_that_camera_and_lens(file, text, lens, tmp_path):
     synthetic.write_frames(tmp_path)
-    given = {"first_pixel_centre": 0.5, "distortion": LENS}
-    plain = open_recording(tmp_path, "frames", intrinsics=[31.0, 27.0, 18.5, 13.0], **given)[1]
+    given = {"first_pixel_centre": 0.5, "intrinsics": [31.0, 27.0, 18.5, 13.0]}
+    plain = open_recording(tmp_path, "frames", **given, **lens)[1]
     put(tmp_path / file, [text])
     frame = open_recording(tmp_path, "frames", intrinsics=file)[1]
     np.testing.assert_allclose(frame.K, K)
