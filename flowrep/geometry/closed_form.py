@@ -89,17 +89,17 @@ def motion_coefficients(
         change = torch.nn.functional.pad(prev_K - K, (0, 1))
         x, y = (row + change[..., i, 2:3] * z for i, row in enumerate((x, y)))
         x, y = x + change[..., 0, :], y + change[..., 1, :]
-    in_x, in_y, constant, e = torch.stack(torch.broadcast_tensors(x, y, z), -2).unbind(-1)
+    in_x, in_y, constant, e = torch.stack((x, y, z.expand_as(x)), -2).unbind(-1)
     a_x = in_x / fx  # ... K'^-1
     a_y = (in_y - skew * a_x) / fy
     coefficients = torch.cat([a_x, a_y, constant, e], -1)
-    unknown = ~(known & bounded & _within_bounds(coefficients, (-1,))).unsqueeze(-1)
+    known = (known & bounded & _within_bounds(coefficients, (-1,))).unsqueeze(-1)
     behind = (0.0, -2.0, 0.0)  # 1 + qz = -1
-    # Concatenated, so that inductor stores the twelve numbers. It would fuse a single `masked_fill`
+    # Concatenated, so that inductor stores the twelve numbers. It would fuse a single `where`
     # with the code that reads them and repeat it at every pixel, and `factorize` would take 1.4 to
     # 1.7 times as long.
     parts = zip((coefficients[..., :8], coefficients[..., 8:9], coefficients[..., 9:]), behind)
-    return torch.cat([part.masked_fill(unknown, otherwise) for part, otherwise in parts], -1)
+    return torch.cat([torch.where(known, part, otherwise) for part, otherwise in parts], -1)
 
 
 def _focal(K: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -183,23 +183,31 @@ class MapTransform(Transform):
         for key, value in zip(self.out_keys, outputs):
             into.set(key, value)
 
-    def _check_values(self, tensordict: TensorDictBase) -> None:
-        """Raises ValueError for values at a batch's root that can't be right: a subclass may."""
+    def _check_values(self, tensordict: TensorDictBase, *, waits: bool = False) -> None:
+        """Raises ValueError for values that can't be right, if a subclass checks any.
+
+        It is called at resets and for the root of batches; only with `waits` may it wait for a GPU.
+        """
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         # TorchRL's `_reset` doesn't call the transform.
         begins = tensordict.get("_reset", None)
+        if begins is None:
+            self._check_values(tensordict_reset, waits=True)
         # Selecting rows by a mask waits for a GPU, and each new number of rows would recompile.
         if begins is None or begins.is_cuda or self.compiled:
             return self._call(tensordict_reset)
         rows = flags_of_batch(begins, tensordict_reset)
         if rows.all() == rows.any():
+            self._check_values(tensordict_reset)
             return self._call(tensordict_reset)
         # TorchRL keeps only the rows that are reset. Computing the others, too, would be slow for
         # estimated flow.
-        reset = self._call(tensordict_reset[rows])
+        reset = tensordict_reset[rows]
+        self._check_values(reset)
+        reset = self._call(reset)
         for key in self.out_keys:
             if (value := reset.get(key, None)) is not None:
                 whole = value.new_zeros((*rows.shape, *value.shape[1:]))

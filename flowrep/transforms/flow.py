@@ -26,7 +26,6 @@ from flowrep.transforms.base import (
     as_keys,
     check_choice,
     check_distinct_keys,
-    flags_of_batch,
 )
 
 CAMERA = Reads((3, 3), "float")
@@ -105,7 +104,6 @@ class CameraTransform(MapTransform):
         return maps
 
     def _check_values(self, tensordict: TensorDictBase, *, waits: bool = False) -> None:
-        """Raises ValueError for a K under a key that can't be that of the maps."""
         if not self.camera_keys or torch.compiler.is_compiling():
             return
         if any(tensordict.get(key, None) is None for key in self.in_keys):
@@ -115,16 +113,6 @@ class CameraTransform(MapTransform):
             if K.is_cpu or (waits and not K.is_meta):
                 size = _map_size(maps, self.reads)
                 geometry.check_intrinsics(f"key {key!r}", K, size, allow_unknown=True)
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        begins = tensordict.get("_reset", None)
-        if begins is None:
-            self._check_values(tensordict_reset, waits=True)
-        elif self.camera_keys and begins.device.type == "cpu":
-            self._check_values(tensordict_reset[flags_of_batch(begins, tensordict_reset)])
-        return super()._reset(tensordict, tensordict_reset)
 
     def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
         maps = super()._read(tensordict)
@@ -315,7 +303,7 @@ class FlowFactorize(FlowTransform):
     | `("sensor", "depth")`, m | `"obj"` | float `[*B, 2, H, W]` | any | px/step × `scale` |
     | `("sensor", "prev_from_curr")` | `"raw"` if chosen | as above | any | as above |
     | `"raw_valid"`, if there | `"valid"` if chosen | bool `[*B, 1, H, W]` | | |
-    | | `"raw_valid"` with raw | as `"valid"` | | |
+    | `movable`, if given | `"raw_valid"` with raw | as `"valid"` | | |
 
     Convention: ego is the flow that the camera's motion alone would cause (Eqs. 7–11 of the paper),
     obj = raw − ego is the flow of what moves by itself (Eq. 6), with `RawFlow`'s sign, grid and
@@ -331,6 +319,9 @@ class FlowFactorize(FlowTransform):
         outputs: which of `"ego"`, `"obj"`, `"raw"` (raw flow times its scale, 0 where it isn't
             finite) and `"valid"` to write. For ego alone, raw flow isn't read.
         scale: factor on the flows, or a mapping from output to factor.
+        movable: key of a mask or ids `[*B, 1, H, W]`, 0 where nothing can move by itself, such as a
+            detector's mask of people. Object flow is 0 there, whatever an error of the camera's
+            motion (odometry's drift) would leave.
         compiled: see `RawFlow`.
         in_keys: raw flow (in px/step, unscaled), depth and camera motion; for ego alone, only the
             last two.
@@ -364,6 +355,7 @@ class FlowFactorize(FlowTransform):
         prev_intrinsics: NestedKey | None = None,
         outputs: Sequence[str] = ("ego", "obj"),
         scale: float | Mapping[str, float] = 1.0,
+        movable: NestedKey | None = None,
         compiled: bool = False,
         in_keys: Keys | None = None,
         out_keys: Keys | None = None,
@@ -372,20 +364,29 @@ class FlowFactorize(FlowTransform):
         keys: Keys = EGO_KEYS
         if {"obj", "raw"} & set(outputs):
             reads, keys = [base.FLOW, *reads], ["raw", *EGO_KEYS]
-        keys = keys if in_keys is None else in_keys
+        keys = as_keys(keys if in_keys is None else in_keys)
+        if movable is not None:
+            if "obj" not in outputs:
+                raise ValueError(f"movable={movable!r} is for obj, which {list(outputs)} lacks")
+            reads, keys = [*reads, Reads((1, "H", "W"))], [*keys, *as_keys([movable])]
         options: Any = {"outputs": outputs, "scale": scale, "compiled": compiled}
         options |= {"prev_intrinsics": prev_intrinsics}
         super().__init__(intrinsics, reads, keys, out_keys, **options)
+        self.has_movable = movable is not None
         if self.scales.get("raw", 1.0) != 1.0:
             check_distinct_keys(self)
 
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
-        """Returns the chosen outputs, from (raw,) depth and camera motion (and K)."""
+        """Returns the chosen outputs, from (raw,) depth and camera motion (and movable, K)."""
         *raw, depth, motion, K, prev_K = self._at_one_precision(maps)
+        if self.has_movable:
+            *raw, depth, motion, movable = [*raw, depth, motion]
         if not raw:
             ego, valid = geometry.ego_flow(depth, K, motion, prev_K=prev_K)
             return self._chosen({"ego": ego}, valid)
         ego, obj, valid = geometry.factorize(raw[0], depth, K, motion, prev_K=prev_K)
+        if self.has_movable:
+            obj = torch.where(movable != 0, obj, 0.0)
         flows, known = {"ego": ego, "obj": obj}, None
         if "raw" in self.outputs:
             flows["raw"] = torch.where(raw[0].isfinite(), raw[0], 0.0)
@@ -422,7 +423,8 @@ def masked_flow(flow: Tensor, key: NestedKey, tensordict: TensorDictBase) -> Ten
             f"{list(shape)}; got {known.dtype} {list(known.shape)}: convert or rename it"
         )
     # As bytes, because inductor's CPU code can't compile a `where` on `RawFlow`'s view as bool.
-    return torch.where(as_type(known, torch.bool).view(torch.uint8) != 0, flow, math.nan)
+    unknown = as_type(known, torch.bool).view(torch.uint8) == 0
+    return flow.masked_fill(unknown, math.nan)
 
 
 def mask_key(flow: NestedKey) -> NestedKey:

@@ -244,6 +244,20 @@ def test_a_camera_that_is_none_is_refused(make):
         make(None)
 
 
+@pytest.mark.parametrize("dtype", [torch.bool, torch.uint8])
+def test_drift_of_odometry_leaves_no_object_flow_where_nothing_can_move(dtype):
+    td = RawFlow(K)(scene())
+    exact = FlowFactorize(K)(td.clone())["obj"]
+    td["people"] = (td["sensor", "instance"] == 1).to(dtype)
+    td["sensor", "prev_from_curr"][0, 3] += 0.02
+    drifted = FlowFactorize(K, movable="people")(td.clone())["obj"]
+    assert torch.equal(drifted != 0, td["people"].bool().expand(2, -1, -1))
+    # fx * 0.02 m / 8 m = 0.1 px of the drift is left on who moves
+    torch.testing.assert_close(drifted[:, 0, 1], exact[:, 0, 1] + torch.tensor([0.1, 0.0]))
+    with pytest.raises(ValueError, match="movable"):
+        FlowFactorize(K, outputs=["ego"], movable="people")
+
+
 def test_ego_alone_reads_no_raw_flow():
     transform = FlowFactorize(K, outputs=["ego"])
     assert transform.in_keys == [("sensor", "depth"), ("sensor", "prev_from_curr")]
