@@ -121,16 +121,16 @@ def test_without_rerun_the_package_is_named_and_nothing_is_left(tmp_path, monkey
     assert not list(tmp_path.iterdir())
 
 
-def test_a_wrong_convention_ends_the_job_unless_a_warning_will_do(moments, tmp_path, capsys):
+def test_a_wrong_convention_ends_the_job_if_asked_and_else_is_a_warning(moments, tmp_path, capsys):
     wrong = ["format.pose_direction=world_to_camera", "video=false", "flow_files=[]"]
     wrong += ["flow=exact", "pictures_every=0"]
-    code, out = factorize(tmp_path, *wrong)
+    code, out = factorize(tmp_path, *wrong, "check=error")
     said = capsys.readouterr()
     assert code == 2
     assert "format.pose_direction=camera_to_world" in said.out
     assert "check=warn" in said.err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in"]
-    code, out = factorize(tmp_path, *wrong, "check=warn")
+    code, out = factorize(tmp_path, *wrong)
     assert code == 0
     assert capsys.readouterr().out.startswith("wrong: ")
     summary = json.loads((out / "summary.json").read_text())

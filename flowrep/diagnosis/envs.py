@@ -14,18 +14,17 @@ from torch.nn import functional
 from flowrep import geometry
 from flowrep.diagnosis.fit import (
     EYE,
-    INTERPOLATED_PX,
     Pairs,
-    best_motion,
+    length,
     median,
-    quantile_px,
+    refined,
     residuals,
     sampled,
     seen_before,
 )
 from flowrep.diagnosis.recordings import FROZEN, no_diagnosis, note_on_untested, reasons_untestable
 from flowrep.diagnosis.rivals import rivals_of
-from flowrep.diagnosis.verdict import Diagnosis, diagnosed, is_better
+from flowrep.diagnosis.verdict import Diagnosis, diagnosed
 
 _PAIRS = 8  # that are tested at most, to save time
 # A body counts in each frame that shows it.
@@ -34,6 +33,7 @@ _MOVED_PX = 0.25  # least flow or residual of a body that is tested: with less, 
 _FEW_PIXELS = 32  # least pixels of a body that is tested
 _FEW_FRAMES = 3  # least frames of a body that is tested
 _WORLD_SHARE = 0.2  # of the picture: with more of id 0, it is the world if motions are unknown
+INTERPOLATED_PX = 0.04  # residuals of round bodies, whose depth interpolation is not exact
 _ROUND = 0.05  # of a body's flow: interpolated depth is less exact where bodies are round
 # Flow that is computed again differs by rounding: by these pixels, and by this share of its length.
 _SAME_PX = 0.02
@@ -41,6 +41,7 @@ _SAME_SHARE = 0.01
 _ADAPTERS = {
     "pose_layout": "AdaptPose", "pose_direction": "AdaptPose", "pose_axes": "AdaptPose",
     "depth_kind": "AdaptDepth", "near_m": "AdaptDepth", "far_m": "AdaptDepth",
+    "baseline_m": "AdaptDepth",
     "flow_direction": "AdaptFlow", "flow_channels": "AdaptFlow",
 }  # fmt: skip
 """Options of recordings, and the transform that has each as an argument."""
@@ -81,7 +82,7 @@ def diagnose(
     K, prev_K = (torch.as_tensor(each).float().expand(len(now), 3, 3) for each in both)
     geometry.check_intrinsics("K", K)
     kept = _motion(now).isfinite().flatten(1).all(1).nonzero()[:, 0]
-    kept = kept[_spread(len(kept), 3 * _PAIRS)]
+    kept = kept[_spread(len(kept), 2 * _PAIRS)]
     seen = _Seen(now[kept], before[kept], K[kept], prev_K[kept], raw_key)
     if bool((seen.depth < 0).double().mean() > 0.5):
         why = "depth is negative: give its opposite"
@@ -94,7 +95,8 @@ def diagnose(
     raw, picture = None, None
     if is_measured := not seen.is_derived:
         raw, picture = seen.raw, seen.now["sensor"].get("rgb", None)
-    maps = (static, seen.before, seen.K, seen.prev_K, torch.stack(path, 1), picture)
+    before = torch.where(seen.was_static[:, 0], seen.before, math.nan)
+    maps = (static, before, seen.K, seen.prev_K, torch.stack(path, 1), picture)
     pairs = sampled(raw, *maps)
     reasons = reasons_untestable(pairs)
     names = [str(index) for index in kept.tolist()]
@@ -105,9 +107,9 @@ def diagnose(
     rivals = rivals_of({}, by_flow=is_measured, of_flow=is_measured, absolute=is_absolute)
     frozen = [name for name, why in zip(names, reasons) if why == FROZEN]
     names = [names[i] for i in testable.tolist()]
-    result = diagnosed(pairs.select(testable), [], rivals, names, _adapter_call, frozen)
+    result = diagnosed(pairs.select(testable), rivals, names, _adapter_call, frozen)
     faults, odd = _recomputed(seen, ego_key, obj_key)
-    kind, of_bodies = ("", "") if result.is_wrong else _bodies(seen, pairs.depth_step)
+    kind, of_bodies = ("", "") if result.is_wrong else _bodies(seen, result.error_px)
     odd += note_on_untested(reasons, sum(not why for why in reasons))
     odd += [of_bodies] * (kind == "untested")
     result = replace(result, notes=(*result.notes, *odd))
@@ -115,8 +117,6 @@ def diagnose(
         words = "; ".join([result.words, *faults] if result.is_wrong else faults)
         verdict = result.verdict if result.is_wrong else "wrong"
         return replace(result, verdict=verdict, words=words)
-    if kind == "doubt" and result.is_right:
-        return replace(result, verdict="can't tell", words=f"{of_bodies}; else {result.words}")
     return result
 
 
@@ -172,10 +172,13 @@ class _Seen:
         rows = self.ids.clamp(0, self.rows.shape[1] - 1)
         # Many simulators number what stands still, too.
         stands = (self.rows - self.rows[:, :1]).abs().flatten(2).amax(-1) < 1e-6
-        self.is_static = stands.gather(1, rows.flatten(1)).view_as(rows)
+        before = self.ids_before.clamp(0, self.rows.shape[1] - 1)
+        self.is_static, self.was_static = (
+            stands.gather(1, ids.flatten(1)).view_as(ids) for ids in (rows, before)
+        )
         is_world = (self.ids == 0) & self.depth.isfinite()
         if not self.has_rows and is_world.double().mean() > _WORLD_SHARE:
-            self.is_static = self.ids == 0
+            self.is_static, self.was_static = self.ids == 0, self.ids_before == 0
         self.flow = geometry.rigid_flow(self.depth, rows, self.K, self.rows, prev_K=self.prev_K)
         self.ego = self.flow_of(self.motion)
         self.raw, self.is_derived = now.get(raw_key, None), True
@@ -183,7 +186,7 @@ class _Seen:
             valid = now.get(f"{raw_key}_valid", torch.ones_like(self.flow.valid))
             self.raw = torch.where(valid, self.raw.double(), math.nan)
             expected = torch.where(self.flow.valid, self.flow.flow, math.nan)
-            self.is_derived = not median(quantile_px((self.raw - expected).flatten(2))) > 0.01
+            self.is_derived = not median(length((self.raw - expected).flatten(2))) > 0.01
 
     def flow_of(self, motion: Tensor) -> geometry.Flow:
         """Returns the flow of a static world."""
@@ -206,7 +209,7 @@ def _recomputed(seen: _Seen, ego_key: str, obj_key: str) -> tuple[list[str], lis
             continue
         right, given = (x.double().movedim(1, -1).flatten(0, -2) for x in (right, given))
         counts = (right.norm(dim=-1) > 0.05) & right.isfinite().all(-1) & given.isfinite().all(-1)
-        if not counts.any():
+        if counts.sum() < 0.01 * counts.numel():
             continue
         right, given = right[counts], given[counts]
         factor = float((given * right).sum() / right.square().sum())
@@ -222,8 +225,8 @@ def _recomputed(seen: _Seen, ego_key: str, obj_key: str) -> tuple[list[str], lis
     return faults, odd
 
 
-def _bodies(seen: _Seen, depth_step: float) -> tuple[str, str]:
-    """Returns "fault", "untested", "doubt" or "" of bodies' ids and motions, and the reason.
+def _bodies(seen: _Seen, error_px: float) -> tuple[str, str]:
+    """Returns "fault", "untested" or "" of bodies' ids and motions, and the reason.
 
     Each body of each frame is judged as the camera is: by the residuals of its motion on the body's
     pixels, with the depth of the previous frame as reference, and by those of the best motion.
@@ -239,7 +242,7 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[str, str]:
     moving = moved.any(0).nonzero()[:, 0].tolist()  # rows that are nan don't count
     if moving and not (ids > 0).any():
         which = f"{moving[0]} to {moving[-1]}"
-        return "doubt", f"bodies {which} move, but no pixel of instance has their ids"
+        return "untested", f"bodies {which} move, but no pixel of instance has their ids"
     known = torch.where(seen.depth[:, 0].isfinite() & (ids > 0), ids, 0)
     sizes = functional.one_hot(known.flatten(1), count).sum(1)
     body, frame = (sizes.T[1:] >= _FEW_PIXELS).nonzero().T
@@ -258,33 +261,39 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[str, str]:
     first = EYE.expand(len(frame), 4, 4)
     path = torch.stack([first, first, seen.rows[frame, body], first], 1)
     pairs = sampled(None, depth, before, seen.K[frame], seen.prev_K[frame], path)
-    pairs = pairs._replace(depth_step=depth_step, coarseness=depth_step / pairs.depth)
     still = seen.motion[frame]
     at, at_rest = (seen_before(pairs, motion)[0] for motion in (pairs.motion, still))
     residuals_px = residuals(pairs, pairs.motion)
-    moved_px, residual_px = quantile_px(at - at_rest), quantile_px(residuals_px, 0.5)
+    moved_px, residual_px = _middle(at - at_rest), _middle(residuals_px)
     number = residuals_px.isfinite().sum((1, 2))
     testable = (torch.maximum(moved_px, residual_px) >= _MOVED_PX) & (number >= _FEW_PIXELS)
     if int(testable.sum()) < _FEW_FRAMES:
         return "untested", unseen
     pairs, body, still = pairs.select(testable), body[testable], still[testable]
     residual_px, moved_px = residual_px[testable], moved_px[testable]
-    best_px = quantile_px(residuals(pairs, best_motion(pairs, pairs.motion, still)), 0.5)
-    at_rest_px = quantile_px(residuals(pairs, still), 0.5)
-    least = INTERPOLATED_PX + _ROUND * moved_px
+    noise = torch.full_like(pairs.depth, INTERPOLATED_PX)
+    best = refined(pairs, torch.stack([pairs.motion, still]), noise)
+    best_px = torch.stack([_middle(residuals(pairs, each)) for each in best]).amin(0)
+    at_rest_px = _middle(residuals(pairs, still))
+    # Errors of poses are in the motions of bodies, too.
+    least = INTERPOLATED_PX + _ROUND * moved_px + error_px
     for name, rows in (
         ("the bodies", body > 0), *((f"body {i}", body == i) for i in body.unique().tolist())
     ):  # fmt: skip
         is_off = int(rows.sum()) >= _FEW_FRAMES and median((residual_px - least)[rows]) > 0
-        if is_off and is_better(best_px[rows], residual_px[rows]):
-            px, flow, best = (median(each[rows]) for each in (residual_px, moved_px, best_px))
+        if is_off and median(best_px[rows]) < median(residual_px[rows]) / 2:
+            px, size, least_px = (median(x[rows]) for x in (residual_px, moved_px, best_px))
             why = f"instance_motion or ids don't fit {name}: the residual is {px:.2g} px"
-            why += f" (flow: {flow:.2g} px), and {best:.2g} px with the best motion"
+            why += f" (flow: {size:.2g} px), and {least_px:.2g} px with the best motion"
             return "fault", why
     # A flat body that moves aside changes no depth: it might as well be at rest.
     if int((at_rest_px > least).sum()) < _FEW_FRAMES:
         return "untested", "depth hardly shows how bodies move: motions of bodies are not tested"
     return "", ""
+
+
+def _middle(vectors: Tensor) -> Tensor:
+    return length(vectors).nanmedian(-1).values
 
 
 def _adapter_call(remedy: str, _: Pairs) -> str:
@@ -299,6 +308,6 @@ def _adapter_call(remedy: str, _: Pairs) -> str:
         f"{key}={value}" if key.endswith("_m") else f'{key.partition("_")[2]}="{value}"'
         for key, value in options.items()
     ]
-    if options.get("depth_kind") == "ray_length":
+    if options.get("depth_kind") in ("ray_length", "disparity"):
         arguments.append("intrinsics=K")
     return f"{adapter}({', '.join(arguments)})"

@@ -10,10 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from flowrep import geometry
-from flowrep.diagnosis.fit import EYE, FITTED, Pairs, best_motion, quantile_px, sampled, seen_before
+from flowrep.diagnosis import fit
+from flowrep.diagnosis.fit import EYE, Pairs, length, sampled
 from flowrep.diagnosis.rivals import rivals_of
-from flowrep.diagnosis.verdict import Diagnosis, diagnosed, fitted
+from flowrep.diagnosis.verdict import Diagnosis, diagnosed
 
 # Pairs with fewer known pixels or less flow are not tested: they tell nothing.
 _LEAST_PIXELS = 64
@@ -34,7 +34,7 @@ class Examination:
 
     conventions: Mapping[str, str] = field(default_factory=dict)
     flow_is_recorded: bool = True
-    _seen: list[tuple[Pairs, Tensor, str]] = field(default_factory=list)  # motion, name
+    _seen: list[tuple[Pairs, str]] = field(default_factory=list)  # name
     _reasons: list[str] = field(default_factory=list)
     _frozen: list[str] = field(default_factory=list)
     _intervals_s: list[float] = field(default_factory=list)
@@ -65,9 +65,7 @@ class Examination:
             self._reasons.append(why)
             self._frozen += [current.name] * (why == FROZEN)
             return False
-        options: Any = {"prev_K": prev_K.float(), "picture": picture}
-        motion = geometry.camera_motion(flow, now[:, None], K.float(), **options).prev_from_curr
-        self._seen.append((pairs, motion.double(), current.name))
+        self._seen.append((pairs, current.name))
         if previous.timestamp_s is not None and current.timestamp_s is not None:
             self._intervals_s.append(current.timestamp_s - previous.timestamp_s)
         return True
@@ -77,11 +75,11 @@ class Examination:
         """Returns the diagnosis of all pairs so far."""
         if not self._seen:
             return no_diagnosis(self._reasons)
-        parts, motions, names = zip(*self._seen)
+        parts, names = zip(*self._seen)
         options = {"by_flow": True, "of_flow": self.flow_is_recorded, "absolute": True}
         rivals = rivals_of(self.conventions, **options)
-        pairs, starts = Pairs.joined(parts), [torch.cat(motions)]
-        result = diagnosed(pairs, starts, rivals, names, self._instruction, self._frozen)
+        pairs = Pairs.joined(parts)
+        result = diagnosed(pairs, rivals, names, self._instruction, self._frozen)
         return replace(result, notes=(*result.notes, *note_on_untested(self._reasons, len(names))))
 
     def _instruction(self, remedy: str, corrected: Pairs) -> str:
@@ -104,16 +102,20 @@ class Examination:
 
 def reasons_untestable(pairs: Pairs) -> list[str]:
     """Returns why each pair can't be tested, "" if it can, `FROZEN` if its depth shows movement."""
-    ego = quantile_px(pairs.pixel - seen_before(pairs, pairs.motion)[0]).nan_to_num(0.0)
-    moves = torch.maximum(quantile_px(pairs.raw).nan_to_num(0.0), ego) >= _LEAST_MOVEMENT_PX
+    ego = length(fit.flow_of(pairs, pairs.motion)).nanmedian(-1).values.nan_to_num(0.0)
+    raw = length(pairs.raw).nanmedian(-1).values.nan_to_num(0.0)
+    moves = torch.maximum(raw, ego) >= _LEAST_MOVEMENT_PX
     number, has_depth = (~pairs.depth.isnan()).sum(-1), pairs.now.isfinite().flatten(1).any(1)
     is_known = has_depth & (number >= _LEAST_PIXELS)
     # While a camera stands still, depth doesn't change.
     still, frozen = (is_known & ~moves).nonzero()[:, 0], torch.zeros_like(moves)
     if len(still) and pairs.has_poses:
-        few = pairs.select(still, slice(FITTED))._replace(by_flow=False, scale_px=0.5)
-        rest = fitted(few, best_motion(few, few.motion), few.has_poses)
-        frozen[still] = rest.significant > max(rest.least, _LEAST_MOVEMENT_PX)
+        few = pairs.select(still)._replace(by_flow=False)
+        before = fit.residuals(few, few.motion)
+        noise = torch.full_like(few.depth, _LEAST_MOVEMENT_PX)
+        after = fit.residuals(few, fit.refined(few, few.motion.unsqueeze(0), noise)[0])
+        now, then = (length(x).nanmedian(-1).values for x in (before, after))
+        frozen[still] = (now > 2 * _LEAST_MOVEMENT_PX) & (then < now / 3)
     return [_reason(*each) for each in zip(*map(Tensor.tolist, (has_depth, number, moves, frozen)))]
 
 

@@ -14,14 +14,19 @@ from torch import Tensor
 from flowrep import geometry
 from flowrep.diagnosis.fit import (
     EYE,
-    Change,
     Pairs,
+    gauss_newton,
     homogeneous,
     looked_up,
     motion_vector,
+    residuals,
     skew_part,
     small_motion,
 )  # fmt: skip
+
+Change = Callable[[Pairs, Tensor], Pairs]  # of pairs, with numbers [P, k]
+# A fitted factor beyond these, or below their inverse, is no camera's and no unit's.
+_LARGEST_FACTORS = {"camera": 30.0, "depth": 1e5}
 
 
 class Rival(NamedTuple):
@@ -48,6 +53,16 @@ class Rival(NamedTuple):
     usual: tuple[float, ...] = ()
     per_pair: bool = False
     in_pixels: bool = False
+
+    @property
+    def is_vague(self) -> bool:
+        """Whether it stands for many mistakes, and names none."""
+        return self.subject == "depth" and self.remedy.startswith(("depth isn't", "depth plus"))
+
+    @property
+    def is_of_time(self) -> bool:
+        """Whether it interpolates poses, which makes their noise smaller."""
+        return self.change is _later
 
     def texts(self, numbers: Tensor, width: int) -> tuple[str, str]:
         """Returns the remedy and the description, with the numbers that were fitted."""
@@ -102,13 +117,14 @@ def rivals_of(
         Rival("poses", "marker_from_cam={matrix}",
               "poses are a marker's or by angles in another order, {degrees} degrees off",
               lambda p, n: p._replace(path=p.path @ small_motion(n)[:, None]),
-              ((0.0,) * 6,), (0.1,) * 6),
+              ((0.0,) * 6, (3.0, *[0.0] * 5), (0.0, 3.0, *[0.0] * 4), (0.0, 0.0, 3.0, *[0.0] * 3)),
+              (0.1,) * 6),
         Rival("camera", "K's numbers in another order", "K's numbers are fx, cx, fy, cy",
               _camera(lambda fx, cx, fy, cy, w, h, n: (fx, fy, cx, cy))),
         Rival("camera", "K in pixels", "K is in widths and heights",
               _camera(lambda fx, cx, fy, cy, w, h, n: (w * fx, w * cx, h * fy, h * cy))),
         Rival("camera", "K times {0:.3g}", "K is of pictures {inverse} times as large",
-              _camera(lambda *k: [k[-1][0] * x for x in k[:4]]), ((1.0,), (0.5,), (2.0,)), (1.25,)),
+              _camera(lambda *k: [k[-1][0] * x for x in k[:4]]), ((1.0,), (0.4,), (2.5,)), (1.25,)),
         Rival("camera", "cx and cy moved by {px}", "the pictures were cropped, K was not",
               _camera(lambda fx, cx, fy, cy, w, h, n: (fx, cx + w * n[0], fy, cy + w * n[1])),
               ((0.0, 0.0),), (0.1, 0.1)),
@@ -121,11 +137,19 @@ def rivals_of(
         Rival("camera", "distortion=[{0:.2g},0,0,0]", "the lens bends the picture (calibrate it)",
               lambda p, n: p._replace(distortion=n), ((0.0,),), (-0.2,)),
         Rival("depth", "depth times {inverse}", "depth is {0:.3g} times as long as poses say",
-              _depth(lambda z, n: z / n.clamp(1e-6)), ((1.0,), (1e-3,), (1e3,)), (2.0,)),
-        Rival("depth", "{0:.3g} / depth", "depth is {0:.3g} / z, a disparity",
-              _depth(lambda d, n: n.clamp(1e-6) / d), ((1.0,), (100.0,))),
+              _depth(lambda z, n: z / n.clamp(1e-6)),
+              tuple((n,) for n in (1.0, 0.1, 0.2, 0.35, 0.6, 1.7, 3.0, 5.0, 10.0, 1e-3, 1e3)),
+              (2.0,)),
+        Rival("depth", "depth_kind=disparity baseline_m={0:.3g}", "depth is a disparity",
+              lambda p, n: _depth(lambda d, by: by.clamp(1e-6) / d)(p, n * p.K[:, :1, 0]),
+              ((0.01,), (0.05,), (0.2,), (1.0,), (5.0,), (100.0,))),
         Rival("depth", "depth_kind=z_buffer near_m={inverse} far_m={far}",
               "depth is a buffer's", _depth(_from_buffer), ((5.0, -5.0),)),
+        Rival("depth", "depth isn't linear", "depth isn't metres times a unit",
+              _depth(lambda z, n: n[:, :1].clamp(1e-3) * z.clamp(1e-6) ** n[:, 1:].clamp(-3.0)),
+              ((1.0, 1.0), (1.0, 2.0))),
+        Rival("depth", "depth plus {0:.3g} m", "depth has an offset",
+              _depth(lambda z, n: (n[:, 1:] * z + n[:, :1]).clamp(min=1e-6)), ((0.0, 1.0),)),
     ]  # fmt: skip
     is_z = given["depth_kind"] != "ray_length"
     kind, what = ("ray_length", "the ray's length") if is_z else ("z", "z, not the ray's length")
@@ -165,7 +189,8 @@ def rivals_of(
             Rival("flow", "flow times half the size", "flow is in half sizes",
                   partial(_in_sizes, 2)),
             Rival("flow", "flow divided by {0:.3g}", "flow is of pictures {0:.3g} times as large",
-                  lambda p, n: p._replace(gain=p.gain * n.unsqueeze(-1)), ((1.0,),), (1.5,)),
+                  lambda p, n: p._replace(gain=p.gain * n.unsqueeze(-1)),
+                  ((1.0,), (0.4,), (2.5,)), (1.5,)),
             Rival("flow", "flow_to=next backwards=true", "flow leads to the next frame", _to_next),
             Rival("flow", "flow on this frame's grid", "flow is on the previous one's",
                   _of_previous),
@@ -251,17 +276,18 @@ def _zoomed(pairs: Pairs, factors: Tensor) -> Pairs:
 
 def _depth(change: Callable[[Tensor, Tensor], Tensor]) -> Change:
     def changed(pairs: Pairs, n: Tensor) -> Pairs:
-        before = pairs.before  # not used beside flow, and costly to change
-        if not pairs.by_flow:
-            before = change(before.reciprocal(), n.unsqueeze(-1)).reciprocal()
-        return pairs._replace(depth=change(pairs.depth, n), before=before)
+        before, stretch, depth = pairs.before, pairs.stretch, change(pairs.depth, n)
+        if not pairs.by_flow:  # beside flow neither is used
+            before = change(before.reciprocal().flatten(1), n).reciprocal().view_as(before)
+            stretch = (change(pairs.depth * 1.001, n) / depth - 1).abs().clamp(1e-6) / 1e-3
+        return pairs._replace(depth=depth, before=before, stretch=stretch)
 
     return changed
 
 
 def _from_buffer(buffer: Tensor, line: Tensor) -> Tensor:
     """Returns depth from the values of a buffer, 0 to 1, in which inverse depth is linear."""
-    near, slope = (line.movedim(1, 0)[i].unsqueeze(1) for i in (0, 1))
+    near, slope = line.split(1, -1)
     inverse = near + slope.clamp(max=0.0) * buffer
     depth = torch.where(inverse > 1e-4, inverse.reciprocal(), math.inf)
     return torch.where(buffer <= 1, depth, -buffer)
@@ -324,4 +350,62 @@ def _of_previous(pairs: Pairs, n: Tensor) -> Pairs:
 
 
 def _late_depth(pairs: Pairs, n: Tensor) -> Pairs:
-    return _reversed(pairs, pairs.pixel - torch.linalg.solve(pairs.gain, pairs.raw), pairs.now)
+    return _reversed(pairs, pairs.pixel - pairs.shift, pairs.now)
+
+
+def fitted_numbers(
+    pairs: Pairs, rival: Rival, motion: Tensor, noise: Tensor
+) -> tuple[Tensor, float] | None:
+    """Returns a rival's numbers `[P, k]`, fitted to the other half of the pairs, and their cost.
+
+    None if there are too few pairs, or if a factor is too large or too small.
+
+    Args:
+        motion: the recorded motions `[P, 4, 4]`, or those of the pictures in their place.
+        noise: standard deviations of residuals `[P, N]`, px.
+    """
+    count, k, few = len(noise), len(rival.start[0]), pairs.few
+    noise = noise[:, : few.depth.shape[1]]
+    if count < 4 and k > 1:
+        return None
+    is_of_poses = rival.subject == "poses" or "=next" in rival.remedy or "grid" in rival.remedy
+    is_of_poses |= rival.change is _late_depth
+
+    def residuals_of(n: Tensor) -> Tensor:
+        changed = [rival.change(few, each) for each in n]
+        moved = [each.motion if is_of_poses and few.has_poses else motion for each in changed]
+        return torch.stack([residuals(each, m) for each, m in zip(changed, moved)])
+
+    def cost(n: Tensor) -> float:
+        squared = (residuals_of(n.unsqueeze(0)) / noise.unsqueeze(1)).square().sum(2)
+        return float(squared.nan_to_num(1e6).log1p().mean())
+
+    starts = [noise.new_tensor(start).expand(count, k) for start in rival.start]
+    if not k:
+        return starts[0], cost(starts[0])
+    every = torch.arange(count)
+    half = every % 2 if count >= 4 else 0 * every
+    group = every if rival.per_pair else half
+    start = min(starts, key=cost)[0]
+
+    def numbers(m: Tensor) -> Tensor:
+        """Factors are fitted as their logarithms."""
+        return torch.where(start != 0, start * m.exp(), m)
+
+    m = noise.new_zeros(int(group.max()) + 1, k)
+    n = numbers(gauss_newton(lambda m: residuals_of(numbers(m)), m, group, noise, steps=5)[0])
+    if rival.per_pair:
+        # A frame's number is taken from the fit to the other pair that has this frame.
+        follows, own = (pairs.path[1:, 1] == pairs.path[:-1, 2]).flatten(1).all(1), n
+        if not follows.any():
+            return None
+        n = n.clone()
+        n[:-1, 0] = torch.where(follows, own[1:, 1], own[:-1, 0])
+        n[1:, 1] = torch.where(follows, own[:-1, 0], own[1:, 1])
+    else:
+        n = n[half.max() - half]
+    if rival.in_pixels:
+        n = (n * pairs.now.shape[-1]).round() / pairs.now.shape[-1]
+    first, most = n.new_tensor(rival.start[0]), _LARGEST_FACTORS.get(rival.subject, math.inf)
+    factors = n[:, first != 0] / first[first != 0]
+    return (n, cost(n)) if bool(((factors > 1 / most) & (factors < most)).all()) else None

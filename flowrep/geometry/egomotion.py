@@ -222,6 +222,29 @@ def camera_motion(
     return MotionEstimate(motion.to(dtype), share.to(dtype), covariance.to(dtype), valid)
 
 
+@torch.no_grad()
+def motion_of_points(
+    rays: Tensor, inverse_depth: Tensor, flow: Tensor, K: Tensor, known: Tensor
+) -> Tensor:
+    """Returns the motion of the most of some points, `prev_from_curr` `[B, 4, 4]`, float64.
+
+    As `camera_motion`, for points that the caller chose: rays `[B, 3, N]` with z = 1, their inverse
+    depth `[B, N]`, flow `[B, 2, N]` in pixels, K of the previous frame, and which are known
+    `[B, N]`.
+    """
+    known = known & flow.isfinite().all(1) & inverse_depth.isfinite()
+    order = (~known).long().argsort(dim=-1, stable=True)
+    values = torch.cat([rays, inverse_depth.unsqueeze(1), flow], 1).double()
+    values = torch.where(known.unsqueeze(1), values, 1.0)
+    values = values.gather(-1, order.unsqueeze(1).expand_as(values))
+    samples = _Samples(
+        K[:, [0, 0, 1], [0, 1, 1]].double(), values, known.gather(-1, order), known.sum(-1)
+    )
+    start = torch.eye(4, dtype=torch.float64, device=K.device).expand(len(K), 4, 4)
+    motion = _best_hypothesis(samples, samples, start, has_prior=False)
+    return _descended(samples, motion, _STEPS)
+
+
 def structure_tensor(picture: Tensor) -> Tensor:
     """Returns how well a pixel's surroundings determine its flow: xx, xy, yy, `[B, 3, H, W]`.
 

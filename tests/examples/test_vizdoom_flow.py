@@ -20,7 +20,7 @@ def frames(tmp_path_factory):
 
 
 def test_depth_of_a_byte_contradicts_nothing_and_hides_much(frames):
-    # tests/injected has a walk whose pictures tell more: there the conventions are right.
+    # A byte of depth tells little of this walk.
     found = diagnose(frames, K)
     assert found.verdict == "can't tell"
     assert "steps" in found.words
