@@ -234,24 +234,9 @@ def test_estimated_flow_is_scored_against_the_recordings_own(moments, tmp_path, 
     assert all(float(row["epe_px"]) > 0.5 if stride == 1 else row["epe_px"] == "" for row in rows)
 
 
-class Camera:
-    """A stream whose fourth frame begins a clip."""
-
-    has_flow, has_poses, notes = False, True, ()
-
-    def __iter__(self):
-        for number in range(7):
-            yield Frame(
-                name=f"{number}",
-                source=Path("camera"),
-                world_from_cam=np.eye(4),
-                K=np.array([[8.0, 0, 4], [0, 8, 3], [0, 0, 1]]),
-                depth=np.ones((6, 8), np.float32),
-                clip=int(number >= 3),
-            )
-
-
 def test_a_camera_whose_skipped_frame_begins_a_clip_gives_no_pair_across_it(tmp_path):
+    K, depth = np.array([[8.0, 0, 4], [0, 8, 3], [0, 0, 1]]), np.ones((6, 8), np.float32)
+    camera = [Frame(f"{i}", Path("camera"), np.eye(4), K, depth, clip=int(i > 2)) for i in range(7)]
     pairs = []
 
     def flow_source(previous, current):
@@ -259,7 +244,7 @@ def test_a_camera_whose_skipped_frame_begins_a_clip_gives_no_pair_across_it(tmp_
         return np.zeros((2, 6, 8), np.float32)
 
     out = Output(tmp_path / "out", {})
-    Job(Camera(), flow_source, recorded_motion, out, stop=7, stride=2).run()  # 0, 2, 4 and 6
+    Job(camera, flow_source, recorded_motion, out, stop=7, stride=2).run()  # 0, 2, 4 and 6
     assert pairs == [("0", "2"), ("4", "6")]
 
 

@@ -285,17 +285,6 @@ def test_a_unit_of_depth_is_positive(tmp_path):
         sequences.open_recording(tmp_path, "frames", depth_unit_m=-0.001)
 
 
-def test_a_frame_that_a_table_lacks_is_left_out_and_named(tmp_path):
-    synthetic.write_vkitti2(tmp_path)
-    path = tmp_path / "extrinsic.txt"
-    path.write_text("".join(path.read_text().splitlines(keepends=True)[:5]))
-    recording = sequences.open_recording(tmp_path, "vkitti2")
-    assert [frame.name for frame in recording] == ["00000", "00001"]
-    (note,) = recording.notes
-    assert note.startswith("1 of 3")
-    assert "00002" in note
-
-
 def test_frames_of_differing_sizes_are_refused(tmp_path):
     synthetic.write_tum(tmp_path)
     for kind, dtype, shape in (("rgb", np.uint8, (12, 20, 3)), ("depth", np.uint16, (12, 20))):

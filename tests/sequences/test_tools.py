@@ -118,6 +118,8 @@ def test_a_picture_that_colmap_did_not_register_is_left_out(tmp_path):
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:4]))
     recording = open_recording(tmp_path, "colmap", pose_unit_m=2.0)
     assert [frame.name for frame in recording] == ["0002"]
+    assert recording.notes[0].startswith("2 of 3")
+    assert "0000, 0001" in recording.notes[0]
     np.testing.assert_allclose(recording[0].world_from_cam[:3, 3], 2 * synthetic.pose(2)[:3, 3])
 
 
