@@ -27,7 +27,7 @@ from flowrep.config.options import (
     Count,
     CountOrZero,
     Distinct,
-    Flow,
+    FlowOptions,
     Options,
     Positive,
     Text,
@@ -65,7 +65,7 @@ class FactorizeConfig(Command):
     input: Text | int
     output: Text
     format: Reader
-    flow: Flow
+    flow: FlowOptions
     poses: Literal["recorded", "estimated"] | None
     check: Literal["error", "warn"]
     start: CountOrZero

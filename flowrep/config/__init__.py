@@ -1,4 +1,4 @@
-"""How a command line and the files of conf/ become a config, and what a mistake in it is told."""
+"""How a command line and the files of conf/ become a config; how mistakes in them are reported."""
 
 from flowrep.config.yaml_file import CONF_DIR
 

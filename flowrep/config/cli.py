@@ -78,7 +78,7 @@ def run_hydra(config_name: str, job: Callable[[DictConfig], Any], schema: type[C
 
 @contextmanager
 def _composing(typed: Sequence[str]) -> Iterator[None]:
-    """Has Hydra read nothing of a stranger's but data, and its errors name what was typed."""
+    """Makes Hydra read only plain data from others' files, and its errors name what was typed."""
     register_resolvers()
     try:
         with checked_files():
@@ -203,7 +203,7 @@ def _is_out_of_memory(error: Exception) -> bool:
 
 
 def explained(error: Exception) -> str:
-    """Returns an error's line; for a choice that there is not, with those that there are."""
+    """Returns an error's line; for an unknown choice, with the known ones."""
     if _is_out_of_memory(error):
         reason = str(error).partition("\n")[0] or "MemoryError"
         remedy = "use fewer envs, or a smaller camera, network or replay_capacity"

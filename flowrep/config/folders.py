@@ -29,7 +29,7 @@ def run_name(
 
 
 def settings_of(choices: Mapping[str, Any]) -> str:
-    """Returns which file a run's settings are of, that of `debug` or that of `preset`."""
+    """Returns which file a run's settings come from: `debug` if it is chosen, else `preset`."""
     return next(f"{key}={choices[key]}" for key in ("debug", "preset") if choices.get(key))
 
 

@@ -35,7 +35,7 @@ _WHOLE = ("preset", "experiment", "debug", "")  # "" is the folder itself, with 
 
 @contextmanager
 def checked_files() -> Iterator[None]:
-    """Has each file checked that Hydra reads meanwhile, unless it is flowrep's or a plugin's."""
+    """Checks each file that Hydra reads in this context, unless it is flowrep's or a plugin's."""
     # Hydra looks for a file in several folders, and for others that this one names, so that only
     # the class that reads files knows which ones are used.
     kinds: list[Any] = Plugins.instance().discover(ConfigSource)

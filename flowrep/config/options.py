@@ -55,7 +55,7 @@ class Options(BaseModel):
         return self.model_dump(by_alias=True)
 
 
-class Flow(Options):
+class FlowOptions(Options):
     """The source of raw flow; further options are those of `flowrep.transforms.EstimatedFlow`."""
 
     model_config = ConfigDict(extra="allow")

@@ -1,4 +1,4 @@
-"""What a mistake of the user is told: its error, and the choices that there are."""
+"""How a user's mistake is reported: as an error of one line, with the known choices."""
 
 from collections.abc import Iterable
 from difflib import get_close_matches

@@ -30,7 +30,7 @@ from flowrep.config.options import (
     Count,
     CountOrZero,
     Distinct,
-    Flow,
+    FlowOptions,
     OneOrMore,
     Options,
     Renderer,
@@ -68,8 +68,8 @@ def _scene(value: Any) -> Any:
     return load_scene(value)
 
 
-Maps = Annotated[dict[str, dict[str, Any]], AfterValidator(_named)]
-Street = Annotated[InstanceOf[Scene], BeforeValidator(_scene), PlainSerializer(scene_data)]
+MapOptions = Annotated[dict[str, dict[str, Any]], AfterValidator(_named)]
+SceneSection = Annotated[InstanceOf[Scene], BeforeValidator(_scene), PlainSerializer(scene_data)]
 
 
 class ForeignAlgorithm(AlgorithmOptions):
@@ -121,11 +121,11 @@ class EnvConfig(Command):
     num_envs: Count
     num_workers: Workers
     renderer: Renderer
-    representations: Maps
-    flow: Flow
+    representations: MapOptions
+    flow: FlowOptions
     motion: MotionChoice
     noise: dict[str, Any]
-    scene: Street
+    scene: SceneSection
 
     @model_validator(mode="after")
     def _can_be_rendered(self) -> EnvConfig:
@@ -202,9 +202,9 @@ class EvaluateConfig(Command):
 
     run: Annotated[Annotated[list[Text], Field(min_length=1)] | None, OneOrMore]
     algorithm: Trusted
-    scene: Street | None = None
-    representations: Maps | None = None
-    flow: Flow | None = None
+    scene: SceneSection | None = None
+    representations: MapOptions | None = None
+    flow: FlowOptions | None = None
     motion: MotionChoice | None = None
     noise: dict[str, Any] | None = None
     speed: Annotated[SpeedModes, OneOrMore]
@@ -247,8 +247,8 @@ class EvaluateConfig(Command):
 class ViewConfig(Command):
     """The whole config of `flowrep.view`."""
 
-    scene: Street
-    representations: Maps | None = None
+    scene: SceneSection
+    representations: MapOptions | None = None
     policy: Text
     algorithm: Trusted
     speed: SpeedMode

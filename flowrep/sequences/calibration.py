@@ -101,7 +101,7 @@ def _colmap(path: Path) -> dict[str, Any]:
         raise SequenceError(path, f"holds {len(cameras)} cameras: {remedy}")
     _, model, width, height, *numbers = cameras[0]
     if model not in _COLMAP:
-        raise SequenceError(path, f"has the lens {model}; read are {', '.join(_COLMAP)}")
+        raise SequenceError(path, f"has the lens model {model}; flowrep reads {', '.join(_COLMAP)}")
     named = zip(_COLMAP[model].split(), map(float, numbers), strict=True)
     return {"w": int(width), "h": int(height), "camera_model": model, **dict(named)}
 

@@ -8,7 +8,6 @@ an input of the wrong layout, and `MissingKey`, a KeyError, for a missing input.
 """
 
 from flowrep.transforms.adapt import AdaptDepth, AdaptFlow, AdaptPose, BodyRows
-from flowrep.transforms.conventions import CONVENTIONS, Convention, sensors_from
 from flowrep.transforms.estimated_flow import DIS, RAFT, EstimatedFlow
 from flowrep.transforms.flow import FlowFactorize, RawFlow
 from flowrep.transforms.frame_stack import FrameStack
@@ -21,6 +20,7 @@ from flowrep.transforms.motion import (
     PreviousIntrinsics,
 )
 from flowrep.transforms.noise import SensorNoise
+from flowrep.transforms.simulators import CONVENTIONS, Convention, sensors_from
 from flowrep.transforms.stack import REPRESENTATIONS, representation_options, representation_stack
 
 __all__ = [

@@ -1,6 +1,7 @@
-"""Conventions of simulators, by name: `sensors_from("isaac_lab", ...)` returns the adapters.
+"""Simulators by name: `sensors_from("isaac_lab", ...)` returns the adapters of its conventions.
 
-Each is a file in conf/simulator/, in TOML, which Python reads without another package.
+Each is a file in conf/simulator/, in TOML, which Python reads without another package. The axes and
+layouts that these files name are defined in `geometry.pose`.
 """
 
 from __future__ import annotations
