@@ -31,7 +31,6 @@ from flowrep.config.options import (
     Options,
     Positive,
     Text,
-    check_reader_options,
 )
 from flowrep.config.usage import UsageError
 
@@ -142,20 +141,13 @@ def factorize_recording(config: FactorizeConfig) -> int:
 
 def open_stream(config: FactorizeConfig) -> sequences.Stream:
     """Returns the recording or camera that `input` and `format` name."""
-    from flowrep.sequences.declared import DeclaredRecording
-    from flowrep.sequences.formats import READERS
+    from flowrep.sequences.formats import open_reader
 
-    name, options = config.format.target.rpartition(".")[2], config.format.options()
-    if name not in READERS:
-        there = ", ".join(f"flowrep.sequences.{each}" for each in READERS)
-        raise UsageError(f"format._target_={config.format.target}: is no reader; there are {there}")
-    reader = READERS[name]
-    check_reader_options(reader, options)
-    stream: sequences.Stream = reader(str(config.input), **options)
-    if isinstance(stream, DeclaredRecording):
-        typed = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
-        keys = [text.lstrip("+").partition("=")[0] for text in typed]
-        stream.check_files([k.removeprefix("format.") for k in keys if k.startswith("format.")])
+    typed = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
+    keys = [text.lstrip("+").partition("=")[0] for text in typed]
+    given = [key.removeprefix("format.") for key in keys if key.startswith("format.")]
+    reader, options = config.format.target, config.format.options()
+    stream: sequences.Stream = open_reader(reader, str(config.input), options, given)
     return stream
 
 

@@ -24,11 +24,6 @@ from flowrep.sequences.recording import Pose, SequenceError
 Matrix: TypeAlias = NDArray[np.float64]
 Lens: TypeAlias = Literal["opencv", "fisheye"]
 
-MIRROR_REMEDY = (
-    "fy is positive. Where it is negative (ICL-NUIM) the camera is left-handed, with y up and z "
-    "ahead: give fy without its sign, and format.pose_axes=unity mirrors the poses"
-)
-
 
 class Camera(pydantic.BaseModel):
     """A camera in `intrinsics.json`, see docs/factorize.md."""
@@ -178,7 +173,11 @@ def camera_matrix(
         if K[2].tolist() != [0, 0, 1] and K[:, 2].tolist() == [0, 0, 1]:  # written by columns
             K = K.T.copy()
     if K[1, 1] < 0:
-        raise SequenceError(source, MIRROR_REMEDY)
+        cause = (
+            "fy is positive. Where it is negative (ICL-NUIM) the camera is left-handed, with y up"
+        )
+        remedy = "give fy without its sign, and format.pose_axes=unity mirrors the poses"
+        raise SequenceError(source, f"{cause}, z ahead: {remedy}")
     K[:2, 2] += 0.5 - first_pixel_centre
     return K
 

@@ -24,6 +24,7 @@ Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 LeftOut = dict[str, NDArray[np.bool_]]  # frames by why they are left out
 
+_POSE_OPTIONS = "layout", "direction", "axes"
 PLAY_BACKWARDS = (
     "its flow leads to the next frame: format.backwards=true plays it from the last frame to the "
     "first, where that is the previous one"
@@ -112,7 +113,7 @@ class DeclaredRecording(Recording):
         if self.times is not None and self._exists(self.times):
             # Rows in the frames' order hold a time alone; others begin with one.
             columns = None if self.rows_by == "order" else (0, 1)
-            table, rows, *_ = self._rows(self.times, columns)
+            table, (rows, _), _ = self._rows(self.times, columns)
             if table.shape[1] > 1:
                 says = f"has {table.shape[1]} numbers in a row, expected one: seconds, with a point"
                 raise SequenceError(self._path(self.times), says)
@@ -217,10 +218,11 @@ class DeclaredRecording(Recording):
         self._depths = [dict(zip(theirs, depths.values()))[key] for key in ours]
         return {}
 
-    def _rows(
-        self, pattern: str, columns: Sequence[int] | None
-    ) -> tuple[Floats, Indices, Indices, Floats]:
-        """Returns a table's columns, the rows before and after each frame (-1: none), the share."""
+    def _rows(self, pattern: str, columns: Sequence[int] | None) -> tuple[Floats, Indices, Floats]:
+        """Returns a table's columns, each frame's row before and after it, and the share between.
+
+        The rows are `[2, frames]`, -1 for none; without interpolation they are the same.
+        """
         path, by = self._path(pattern), self.rows_by
         keys: Any = None  # None: the rows are in the frames' order
         if "*" in pattern.partition(":")[0]:
@@ -252,16 +254,17 @@ class DeclaredRecording(Recording):
         if not len(table) or not first < end <= table.shape[1]:
             size = f"{len(table)} rows of {table.shape[1]}"
             raise SequenceError(path, f"has {size} numbers, expected {max(end, first + 1)}")
-        before = after = np.arange(len(self._names))
-        share = np.zeros(len(before))
+        rows: Any = np.arange(len(self._names))
+        share = np.zeros(len(rows))
         if keys is None:
-            if len(table) != len(before):
-                raise SequenceError(path, f"has {len(table)} rows for {len(before)} frames")
+            if len(table) != len(rows):
+                raise SequenceError(path, f"has {len(table)} rows for {len(rows)} frames")
         elif by == "time" and self._times_s is not None:
             times_s = _ascending(path, keys * self.time_unit_s) + self.pose_offset_s
-            before = after = nearest(times_s, self._times_s, self.tolerance_s)
             if self.interpolate:
-                before, after, share = between(times_s, self._times_s, self.tolerance_s)
+                *rows, share = between(times_s, self._times_s, self.tolerance_s)
+            else:
+                rows = nearest(times_s, self._times_s, self.tolerance_s)
         else:
             key_of = _plain if by == "name" else _number
             row_of = {_plain(key) if by == "name" else key: row for row, key in enumerate(keys)}
@@ -270,17 +273,16 @@ class DeclaredRecording(Recording):
             if len(row_of) < len(table) or (by != "name" and not np.isfinite(keys).all()):
                 says = f"has two rows with the same {by}, or one that is nan or inf"
                 raise SequenceError(path, f"{says}; select rows with format.rows_where")
-            before = after = np.array([row_of.get(key_of(name), -1) for name in self._names])
-        return table[:, first:end], before, after, share
+            rows = np.array([row_of.get(key_of(name), -1) for name in self._names])
+        return table[:, first:end], np.broadcast_to(rows, (2, len(self._names))), share
 
     def _read_poses(self) -> LeftOut:
         self.has_poses = self.poses is not None and self._exists(self.poses)
         if self.poses is None or not self.has_poses:
             return {}
         path = self._path(self.poses)
-        numbers, before, after, share = self._rows(self.poses, self.pose_columns)
-        options: Any = {"layout": self.pose_layout, "direction": self.pose_direction}
-        options["axes"] = self.pose_axes
+        numbers, rows, share = self._rows(self.poses, self.pose_columns)
+        options: Any = {name: getattr(self, f"pose_{name}") for name in _POSE_OPTIONS}
         poses = as_pose(numbers, path, check=False, **options)
         lost = ~np.isfinite(poses).all((1, 2)) | (poses[:, :3, :3] == 0).all((1, 2))
         if not lost.all():
@@ -291,15 +293,14 @@ class DeclaredRecording(Recording):
                 fixed = "xyz_xyzw" if len(self.marker_from_cam) == 7 else "matrix"
                 marker = np.array(self.marker_from_cam)
                 poses @= as_pose(marker, "marker_from_cam", layout=fixed)
-        lacking, lag = before < 0, max(-len(lost), min(self.pose_lag_frames, len(lost)))
-        lacking |= (np.minimum(before, after) + lag < 0) | (after + lag >= len(lost))
-        before, after = (np.where(lacking, 0, rows + lag) for rows in (before, after))
+        late = rows + max(-len(lost), min(self.pose_lag_frames, len(lost)))
+        lacking = ((rows < 0) | (late < 0) | (late >= len(lost))).any(0)
+        before, after = np.where(lacking, 0, late)
         is_lost = ~lacking & (lost[before] | lost[after])
         if not lost.all():
-            ends = zip(poses[before], poses[after], share)
-            self._poses = (
-                [interpolated_pose(*end) for end in ends] if self.interpolate else poses[before]
-            )
+            self._poses = poses[before]
+            if self.interpolate:
+                self._poses = [*map(interpolated_pose, poses[before], poses[after], share)]
         near = f" within {self.tolerance_s} s" if self.rows_by == "time" else ""
         return {f"without a pose{near}": lacking, f"lost (nan, inf, 0) in {path.name}": is_lost}
 
@@ -315,7 +316,7 @@ class DeclaredRecording(Recording):
                 self.distortion, self.lens = camera.distortion, camera.lens
         lacking, given = np.zeros(len(self._names), dtype=bool), self.intrinsics
         if isinstance(given, str) and ("*" in given or self.intrinsics_columns is not None):
-            numbers, rows, *_ = self._rows(given, self.intrinsics_columns)
+            numbers, (rows, _), _ = self._rows(given, self.intrinsics_columns)
             numbers, lacking = numbers[rows], rows < 0
         else:
             numbers = self._numbers_in(given)

@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 
 from flowrep.config import CONF_DIR, group_choices
 from flowrep.config.options import check_reader_options
-from flowrep.config.usage import closest_first
+from flowrep.config.usage import UsageError, closest_first
 from flowrep.sequences.declared import DeclaredRecording
 from flowrep.sequences.kitti import Kitti
 from flowrep.sequences.recording import Recording, SequenceError
@@ -39,9 +39,17 @@ def open_recording(folder: str | Path, format: str, **options: Any) -> Recording
         there = closest_first(format, group_choices("format"))
         raise SequenceError(f"format={format}", f"is unknown; there are: {there}")
     keys = declaration(format) | options
-    reader = READERS[keys.pop("_target_").rpartition(".")[2]]
-    check_reader_options(reader, keys)
-    recording: Recording = reader(folder, **keys)
-    if isinstance(recording, DeclaredRecording):
-        recording.check_files(options)
+    recording: Recording = open_reader(keys.pop("_target_"), folder, keys, options)
     return recording
+
+
+def open_reader(target: str, source: str | Path, options: dict[str, Any], given: Any) -> Any:
+    """Returns what a reader opens; files that the options `given` by the user name must exist."""
+    if (name := target.rpartition(".")[2]) not in READERS:
+        there = ", ".join(f"flowrep.sequences.{each}" for each in READERS)
+        raise UsageError(f"format._target_={target}: is no reader; there are {there}")
+    check_reader_options(READERS[name], options)
+    stream = READERS[name](source, **options)
+    if isinstance(stream, DeclaredRecording):
+        stream.check_files(given)
+    return stream
