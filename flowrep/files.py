@@ -5,17 +5,14 @@ from __future__ import annotations
 import csv
 import errno
 import io
-import math
 import os
 import secrets
 import shutil
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from glob import escape
-from itertools import count
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 _REFUSED = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES)
 
@@ -37,29 +34,21 @@ def replace_file(path: Path) -> Iterator[Path]:
             # As of any new file; some writers set another mode.
             (partial / path.name).chmod(partial.stat().st_mode & 0o666)
             _flush(partial / path.name)
-            _rename(partial / path.name, path)
+            os.replace(partial / path.name, path)
             _flush(path.parent)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
 
 
+def replace_bytes(path: Path, data: bytes) -> None:
+    """Replaces a file by one with these contents."""
+    with replace_file(path) as partial:
+        partial.write_bytes(data)
+
+
 def replace_text(path: Path, text: str) -> None:
     """Replaces a file by one of this text, in UTF-8."""
-    with replace_file(path) as partial:
-        partial.write_text(text, encoding="utf-8")
-
-
-def replace_files(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Replaces files of a folder by these, given by name, once all are on disk."""
-    with ExitStack() as all_written:
-        for name, data in files.items():
-            partial = all_written.enter_context(replace_file(folder / name))
-            partial.write_bytes(data)
-            _flush(partial)
-
-
-def _rename(file: Path, path: Path) -> None:
-    os.replace(file, path)
+    replace_bytes(path, text.encode("utf-8"))
 
 
 def _flush(path: Path) -> None:
@@ -83,9 +72,9 @@ def _is_link(path: str | Path) -> OSError:
     return OSError(errno.ELOOP, what, str(path))
 
 
-def open_to_append(path: Path) -> IO[bytes]:
+def open_to_append(path: Path) -> io.FileIO:
     """Opens or creates a file to append bytes without a buffer; a link is refused."""
-    return open(str(path), "ab", buffering=0, opener=_open_no_link)
+    return io.FileIO(str(path), "ab", opener=_open_no_link)
 
 
 def _open_no_link(path: str, flags: int) -> int:
@@ -110,35 +99,11 @@ def naming(path: Path) -> Iterator[None]:
         raise OSError(error.errno, problem, str(path)) from error
 
 
-def set_aside(path: Path, problem: object) -> None:
-    """Renames a damaged file, so that a new one can be written, and prints a warning."""
-    names = (path.with_name(f"{path.stem}.damaged{n}{path.suffix}") for n in count(1))
-    other = next(name for name in names if not os.path.lexists(name))
-    path.rename(other)
-    what = " ".join(str(problem).split())
-    print(f"warning: {path} is damaged ({what}); it is {other.name} now", file=sys.stderr)
-
-
 # Tables (CSV) that stay readable if a process is killed while it appends rows.
 
 
 class TableError(ValueError):
     """A table is damaged, or another program's."""
-
-
-def whole_number(cell: str) -> int:
-    """Returns a cell's whole number; raises ValueError unless 64 bits hold it."""
-    value = int(cell)
-    if abs(value) >= 2**63:
-        raise ValueError(f"{cell} has more than 64 bits")
-    return value
-
-
-def finite_number(cell: str) -> float:
-    """Returns a cell's number; raises ValueError for inf and nan."""
-    if not math.isfinite(value := float(cell)):
-        raise ValueError(f"{cell} is not finite")
-    return value
 
 
 def read_rows(
@@ -213,9 +178,7 @@ def append_rows(
     if is_new:
         writer.writeheader()
     writer.writerows(rows)
-    # In one call, so that a process that is killed leaves all rows or none.
-    with naming(path), open_to_append(path) as raw:
-        data = text.getvalue().encode("utf-8")
-        written = raw.write(data)
-        while written < len(data):  # an almost full disk takes a part, and raises at the next call
-            written += raw.write(data[written:])
+    # The buffer passes all rows on in one call: a process that is killed leaves all or none. An
+    # almost full disk takes a part of them, which closing the buffer notices.
+    with naming(path), io.BufferedWriter(open_to_append(path)) as file:
+        file.write(text.getvalue().encode("utf-8"))

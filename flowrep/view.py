@@ -10,7 +10,6 @@ from contextlib import closing
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from flowrep.extras import require
@@ -24,7 +23,7 @@ from flowrep.config.folders import folder_name
 from flowrep.config.usage import UsageError
 from flowrep.experiment.policies import policy_of
 from flowrep.experiment.schema import ViewConfig
-from flowrep.files import replace_files, write_rows
+from flowrep.files import write_rows
 from flowrep.progress import progress_bar
 from flowrep.viz import contact_sheet, write_png, write_video
 
@@ -110,26 +109,20 @@ def view(config: ViewConfig, agent: Agent, film: Film) -> None:
     origin = agent.origin("view") | {"policy": config.policy}
     rows = [replace(each, **origin).row() for each in episodes]
     folder.mkdir(parents=True, exist_ok=True)
-    # Drawn elsewhere first, so that a full disk leaves an earlier view whole.
-    with TemporaryDirectory() as name:
-        new = Path(name)
-        if config.video:
-            pictures = film.pictures(frames, episode)
-            pictures = progress_bar(pictures, what="drawing", unit="frame")
-            write_video(new / "episode.mp4", pictures, fps=episode.fps)
-        chosen = moments([moving_pixels(frame.maps) for frame in frames], config.sheet_rows)
-        write_png(new / "sheet.png", contact_sheet(film.draw(frames[i]) for i in chosen))
-        draw_plan(Layout(scene), tracks, path=path).savefig(new / "plan.png", dpi=110)
-        write_rows(new / "episodes.csv", rows)
-        written = {path.name: path.read_bytes() for path in new.iterdir()}
-    replace_files(folder, written)
-    for name in {*FILES} - {*written}:  # of an earlier view with a film
+    for name in FILES:  # of an earlier view, which may have had a film
         (folder / name).unlink(missing_ok=True)
+    chosen = moments([moving_pixels(frame.maps) for frame in frames], config.sheet_rows)
+    write_png(folder / "sheet.png", contact_sheet(film.draw(frames[i]) for i in chosen))
+    if config.video:
+        pictures = progress_bar(film.pictures(frames, episode), what="drawing", unit="frame")
+        write_video(folder / "episode.mp4", pictures, fps=episode.fps)
+    draw_plan(Layout(scene), tracks, path=path).savefig(folder / "plan.png", dpi=110)
+    write_rows(folder / "episodes.csv", rows)
     shown = ("path", "episode_seed", "outcome", "hit", "return", "length")
     print_table("episodes", [{name: row[name] for name in shown} for row in rows])
     arrived = sum(each.outcome == "success" for each in episodes)
     print(f"{config.policy}: {arrived} of {len(episodes)} episodes end in success")
-    print(f"{folder}: {', '.join(each for each in FILES if each in written)}")
+    print(f"{folder}: {', '.join(each for each in FILES if (folder / each).is_file())}")
 
 
 def drive_on(

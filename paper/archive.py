@@ -25,7 +25,7 @@ from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 import numpy as np
 
 from flowrep.experiment.run import RunFolderError
-from flowrep.files import replace_files
+from flowrep.files import replace_bytes
 from flowrep.report.runs import (
     EPISODE_COLUMNS,
     Cells,
@@ -92,7 +92,7 @@ def write_archive(runs: Sequence[Run], path: Path) -> None:
         for name, text in tables.items():
             archive.writestr(ZipInfo(name), text.encode("utf-8"), ZIP_DEFLATED, 9)
     path.parent.mkdir(parents=True, exist_ok=True)
-    replace_files(path.parent, {path.name: data.getvalue()})
+    replace_bytes(path, data.getvalue())
 
 
 def machine_of(run: Run) -> dict[str, str]:

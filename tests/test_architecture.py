@@ -120,10 +120,6 @@ def test_no_modules_import_each_other():
     TopologicalSorter(graph).prepare()  # its CycleError names them
 
 
-def test_modules_have_a_noun_for_a_name():
-    assert not {path.stem for path in MODULES} & {"utils", "common", "helpers", "misc"}
-
-
 @pytest.mark.slow
 def test_the_transforms_bring_torch_tensordict_and_torchrl_alone():
     """What torchrl itself imports is its own business; flowrep adds nothing to it."""

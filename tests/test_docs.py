@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 import torch
-import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from tensordict import TensorDict
 from torchrl.data import Composite, Unbounded
@@ -29,16 +28,6 @@ from tests.transforms.fake_env import HEIGHT, WIDTH, FakeSensorEnv
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
 PACKAGE = DOCS.parent / "flowrep"
-
-
-def navigation(entries):
-    """Yields the pages that a navigation names, however deep."""
-    for entry in entries:
-        if isinstance(entry, str):
-            yield entry
-        else:
-            for value in entry.values():
-                yield from navigation([value] if isinstance(value, str) else value)
 
 
 def python_of(page):
@@ -71,12 +60,6 @@ def test_the_names_in_the_architecture_lead_somewhere():
     names -= {"evaluation.csv", "config.yaml"}
     for name in names:
         pkgutil.resolve_name(f"flowrep.{name}")
-
-
-def test_the_navigation_names_every_page_once():
-    site = yaml.safe_load((DOCS.parent / "mkdocs.yml").read_text("utf-8"))
-    named = list(navigation(site["nav"]))
-    assert sorted(named) == [str(page.relative_to(DOCS)) for page in PAGES]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

@@ -3,7 +3,6 @@
 import errno
 import os
 import stat
-from contextlib import suppress
 
 import pytest
 
@@ -14,9 +13,7 @@ from flowrep.files import (
     open_to_append,
     read_rows,
     replace_file,
-    replace_files,
     replace_text,
-    set_aside,
     write_rows,
 )
 
@@ -66,12 +63,12 @@ def test_a_replaced_file_is_like_any_new_one(folder):
     assert path.read_bytes() == "é".encode()
 
 
-@pytest.mark.parametrize("step", ["write", "_flush", "_rename"])
+@pytest.mark.parametrize("step", ["write", "_flush", "os.replace"])
 def test_whatever_fails_the_file_is_the_old_one_and_the_error_names_it(folder, monkeypatch, step):
     path = folder / "a.txt"
     path.write_text("old")
     if step != "write":
-        monkeypatch.setattr(files, step, fails)
+        monkeypatch.setattr(f"flowrep.files.{step}", fails)
 
     def write():
         with replace_file(path) as partial:
@@ -85,20 +82,13 @@ def test_whatever_fails_the_file_is_the_old_one_and_the_error_names_it(folder, m
     assert (names(folder), path.read_text()) == (["a.txt"], "old")
 
 
-def test_an_interrupted_writer_leaves_nothing(folder):
-    with suppress(KeyboardInterrupt), replace_file(folder / "a.txt") as partial:
-        partial.write_text("half")
-        raise KeyboardInterrupt
-    assert names(folder) == []
-
-
 def test_a_file_is_on_disk_before_it_has_its_name_and_the_name_is_on_disk_too(folder, monkeypatch):
     order = []
     monkeypatch.setattr(
         os, "fsync", lambda file: order.append(os.readlink(f"/proc/self/fd/{file}"))
     )
-    rename = files._rename
-    monkeypatch.setattr(files, "_rename", lambda *names: (order.append("renamed"), rename(*names)))
+    rename = os.replace
+    monkeypatch.setattr(os, "replace", lambda *names: (order.append("renamed"), rename(*names)))
     replace_text(folder / "a.txt", "new")
     partial, renamed, last = order
     assert partial.endswith("/a.txt")
@@ -135,31 +125,6 @@ def test_a_folder_that_is_a_link_to_another_disk_is_used(folder, tmp_path):
     (folder / "link").symlink_to(there)
     replace_text(folder / "link" / "a.txt", "new")
     assert names(there) == ["a.txt"]
-
-
-OLD, NEW = {"a": b"1", "b": b"1", "c": b"1"}, {"a": b"2", "b": b"2", "c": b"2"}
-
-
-def test_of_several_files_a_full_disk_replaces_none(folder, monkeypatch):
-    replace_files(folder, OLD)
-    monkeypatch.setattr(files, "_flush", fails)
-    with pytest.raises(OSError, match=f"'{folder}/"):
-        replace_files(folder, NEW)
-    assert {path.name: path.read_bytes() for path in folder.iterdir()} == OLD
-
-
-def test_a_damaged_file_is_kept_under_a_name_of_its_own(folder, capsys):
-    kept = set()
-    for text in ("one", "two"):
-        (folder / "a.npz").write_text(text)
-        set_aside(folder / "a.npz", "bad\nzip")
-        (line,) = capsys.readouterr().err.splitlines()
-        assert str(folder / "a.npz") in line
-        assert "bad zip" in line
-        (name,) = {*names(folder)} - kept
-        assert name in line
-        assert (folder / name).read_text() == text
-        kept.add(name)
 
 
 # Tables.

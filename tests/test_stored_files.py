@@ -5,10 +5,7 @@ import os
 import re
 import sys
 from contextlib import suppress
-from dataclasses import asdict
-from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 import yaml
@@ -22,11 +19,9 @@ from flowrep.agent import CheckpointError, checkpoint, load_checkpoint, save_che
 from flowrep.config.options import validated
 from flowrep.config.usage import UsageError
 from flowrep.evaluate import candidates_of
-from flowrep.experiment import film, policies
 from flowrep.experiment.agents import Agent
-from flowrep.experiment.run import RunFolder, RunFolderError, read_drives
+from flowrep.experiment.run import RunFolder, RunFolderError
 from flowrep.experiment.schema import EvaluateConfig, ViewConfig
-from flowrep.scenes import SceneError, load_scene
 from flowrep.train import resumed
 from flowrep.view import agent_of
 from tests.config.composing import composed, plain
@@ -161,12 +156,6 @@ def test_nothing_in_a_stored_config_is_resolved(tmp_path, monkeypatch):
     assert (own["note"], own["experiment"]) == ("${oc.env:SECRET}", "${seed}")
 
 
-def test_a_list_that_a_config_holds_twice_is_read_again(tmp_path):
-    run, ends = RunFolder(tmp_path), [1.0, 2.0]
-    run.write_config({"a": ends, "b": ends})
-    assert run.read_config() == {"a": ends, "b": ends}
-
-
 # Links.
 
 
@@ -193,23 +182,6 @@ def test_no_file_of_a_run_is_written_through_a_link(tmp_path, victim, name, is_t
     assert os.listdir(victim.parent) == ["victim"]
 
 
-def test_a_film_is_written_through_no_link(tmp_path, victim, monkeypatch):
-    """FFmpeg follows those of its temporary files, too, whose names a stranger may know."""
-    frames = [np.zeros((16, 16, 3), np.uint8)] * 3
-    made = SimpleNamespace(
-        drive=lambda _: ([], SimpleNamespace(fps=12.0)), pictures=lambda *_: frames,
-        close=lambda: None,
-    )  # fmt: skip
-    monkeypatch.setattr(film, "Film", lambda agent: made)
-    before = victim.read_text()
-    for name in ("a.mp4", "a.tmp.mp4", ".a.mp4.partial"):
-        (tmp_path / name).symlink_to(victim)
-    film.record_episode(None, tmp_path / "a.mp4", episode_seed=1)
-    assert victim.read_text() == before
-    assert not (tmp_path / "a.mp4").is_symlink()
-    assert (tmp_path / "a.mp4").stat().st_size > 500
-
-
 @pytest.mark.parametrize("name", [".lock", "checkpoint", "tensorboard", "videos", "wandb"])
 def test_a_run_with_a_link_in_place_of_what_it_writes_does_not_begin(tmp_path, victim, name):
     run, before = RunFolder(tmp_path), victim.read_text()
@@ -218,27 +190,6 @@ def test_a_run_with_a_link_in_place_of_what_it_writes_does_not_begin(tmp_path, v
         pass
     assert victim.read_text() == before
     assert os.listdir(victim.parent) == ["victim"]
-
-
-def test_no_pipe_in_a_run_is_waited_for(tmp_path):
-    run = RunFolder(tmp_path / "a")
-    run.path.mkdir()
-    for name in ("config.yaml", "metrics.csv", "evaluation.csv", "drives.npz", "machine.json"):
-        os.mkfifo(run.path / name)
-    assert run.read_episodes() == run.read_metrics() == []
-    assert read_drives(run.drives_path) == {}
-    run.note_machine({"cpu": "x"})
-    with pytest.raises(RunFolderError):
-        RunFolder.all_in(tmp_path)
-
-
-@pytest.mark.parametrize("text", ["../../x", "a/b", "", "x" * 65, "a\nb"])
-def test_a_wandb_id_that_is_a_path_is_refused(tmp_path, monkeypatch, text):
-    monkeypatch.setattr("flowrep.experiment.run.require", lambda *_: None)
-    monkeypatch.setitem(sys.modules, "wandb", object())
-    (tmp_path / "wandb_id").write_text(text)
-    with pytest.raises(UsageError, match="wandb_id"):
-        RunFolder(tmp_path).loggers.add_wandb("offline", {})
 
 
 # Checkpoints that were made to be read.
@@ -265,12 +216,3 @@ def test_a_checkpoint_with_other_contents_is_one_error(tmp_path, metadata):
         load_checkpoint(path)
     with pytest.raises(CheckpointError, match=r"c\.safetensors"):
         load_checkpoint(path, ["a"])
-
-
-@pytest.mark.parametrize("name", ["../x", "/tmp/x", "."])
-def test_a_pretrained_agent_is_one_of_the_files_that_come_with_flowrep(tmp_path, monkeypatch, name):
-    monkeypatch.setattr(policies, "PRETRAINED", tmp_path / "folder")
-    (tmp_path / "folder").mkdir()
-    (tmp_path / "x.safetensors").write_text("")
-    with pytest.raises(SceneError, match="name: "):  # names are letters, digits, _ and -
-        Agent.load("pretrained", scene=asdict(load_scene("straight_road")) | {"name": name})

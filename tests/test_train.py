@@ -123,20 +123,6 @@ def test_a_complete_run_is_not_evaluated_twice(smoke_run):
     assert (run / "evaluation.csv").read_text() == before
 
 
-def test_evaluate_adds_rows_for_what_was_asked(smoke_run):
-    run, _ = smoke_run
-    asked = ["speed=high", "fps=[6,12]", "episodes=2", "num_envs=2", "num_workers=2", "seed=77"]
-    asked += ["policy=sampled", "baselines=[never_turn]"]
-    before = read_rows(run / "evaluation.csv")
-    command("evaluate", f"run={run}", *asked, cwd=run)
-    added = read_rows(run / "evaluation.csv")[len(before) :]
-    kinds = [(row["speed"], float(row["fps"]), row["policy"]) for row in added]
-    assert sorted(set(kinds)) == [
-        ("high", fps, policy) for fps in (6.0, 12.0) for policy in ("never_turn", "sampled")
-    ]
-    assert len(kinds) == 8
-
-
 def test_a_run_on_estimated_flow_is_trained_evaluated_and_filmed(tmp_path):
     pytest.importorskip("cv2", reason="flow is estimated by OpenCV")
     asked = ["flow=estimated", "flow.preset=ultrafast", "motion=estimated", "total_frames=64"]

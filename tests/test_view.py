@@ -27,7 +27,6 @@ from flowrep.view import (
     view,
 )
 from tests.config.composing import plain
-from tests.viz.test_video import full_after
 
 SMALL = ["scene.camera.height_px=24", "scene.camera.width_px=32", "episodes=2", "sheet_rows=2"]
 
@@ -44,10 +43,10 @@ def asked(*overrides):
     return validated(ViewConfig, plain("view", *overrides))
 
 
-def show(*overrides, disk_bytes=10**9):
+def show(*overrides):
     config = asked(*SMALL, *overrides)
     agent = agent_of(config, is_scene_given=True)
-    with closing(Film(agent)) as film, full_after(disk_bytes):
+    with closing(Film(agent)) as film:
         view(config, agent, film)
 
 
@@ -114,15 +113,6 @@ def test_a_view_replaces_the_files_of_an_earlier_one_and_no_others(tmp_path):
     assert [path.name for path in tmp_path.iterdir() if path.read_bytes() == b"old"] == [
         "notes.txt"
     ]
-
-
-@pytest.mark.slow
-def test_a_full_disk_leaves_the_earlier_view_whole(tmp_path):
-    (tmp_path / "sheet.png").write_text("old")
-    with pytest.raises(OSError, match=r"episode\.mp4"):
-        show("scene.time_limit_steps=20", "episodes=1", f"output={tmp_path}", disk_bytes=5_000)
-    assert [path.name for path in tmp_path.iterdir()] == ["sheet.png"]
-    assert (tmp_path / "sheet.png").read_text() == "old"
 
 
 def test_a_refused_view_leaves_no_folder(tmp_path, monkeypatch, capsys):

@@ -40,7 +40,9 @@ def env(config: EnvConfig, **changes: Any) -> EnvBase:
     num_envs = changes.get("num_envs", config.num_envs)
     num_workers = changes.get("num_workers", config.num_workers)
     if num_workers == "auto":
-        num_workers = worker_count(num_envs, _busy_cores(config))
+        on_cpu = device(config.device).type == "cpu"  # where updates need cores of their own
+        busy = config.threads if isinstance(config, TrainConfig) and on_cpu else 0
+        num_workers = worker_count(num_envs, busy)
     arguments: dict[str, Any] = {
         "scene": config.scene,
         "representations": config.representations,
@@ -172,13 +174,6 @@ def share_cores(config: EnvConfig) -> None:
     """
     if device(config.device).type == "cpu" and config.flow.source == "exact":
         torch.set_num_threads(1)
-
-
-def _busy_cores(config: EnvConfig) -> int:
-    """Returns the number of cores that a training's updates use."""
-    if not isinstance(config, TrainConfig) or device(config.device).type != "cpu":
-        return 0
-    return config.threads
 
 
 def evaluation_workers(config: EnvConfig, num_envs: int) -> int:

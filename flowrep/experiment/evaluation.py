@@ -134,6 +134,7 @@ def evaluate(
             key: tensordict[key].tolist()
             for key in ("vehicle", "reward", "outcome", "hit", "path", "episode_seed")
         }
+        # `tolist` above copies each key once; reading env by env would wait for a GPU each time.
         free = [i for i in busy if status["outcome"][i][0]]
         for i in busy:
             running[i].positions.append(status["vehicle"][i][:2])

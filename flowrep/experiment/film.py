@@ -138,6 +138,7 @@ class Film:
         frames: list[FilmFrame] = []
 
         def act(tensordict: TensorDictBase) -> TensorDictBase:
+            # `keep` has appended the frame that the policy sees now.
             acted = self.policy(tensordict)
             frames[-1] = frames[-1]._replace(action=int(acted["action"]))
             return acted

@@ -16,7 +16,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from flowrep.files import finite_number, read_rows, whole_number
+from flowrep.files import read_rows
 
 if TYPE_CHECKING:
     import numpy as np
@@ -85,8 +85,7 @@ EVALUATION_COLUMNS = tuple(_FIELDS)
 
 _LATER = ("scene_id", "path")  # columns that older tables lack; they are read as empty
 _CHECKS: dict[str, Callable[[str], Any]] = {
-    "frames": whole_number, "fps": finite_number, "episode_seed": whole_number,
-    "length": whole_number, "outcome": OUTCOMES.index,
+    "frames": int, "fps": float, "episode_seed": int, "length": int, "outcome": OUTCOMES.index,
 }  # fmt: skip
 """How cells of evaluation.csv are checked: a misspelt outcome would count as a failure."""
 
@@ -100,6 +99,7 @@ def read_episodes(path: Path) -> list[dict[str, str]]:
 
 def is_finished(folder: Path, config: TrainConfig) -> bool:
     """Returns whether a run's final evaluation is in its folder."""
+    # A run that was made longer keeps the final evaluation of its earlier, shorter self.
     frames = [int(row["frames"]) for row in _final_rows(folder)]
     enough = sum(each >= config.total_frames for each in frames)
     return enough >= config.evaluation.final_total

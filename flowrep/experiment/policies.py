@@ -5,7 +5,6 @@ Commands check names before they import PyTorch, so here only what loads a polic
 
 from __future__ import annotations
 
-import logging
 import sys
 import sysconfig
 import traceback
@@ -392,16 +391,12 @@ def _program(path: str, task: Task) -> Callable[[TensorDictBase], Tensor]:
     import torch
     from torch.export.passes import move_to_device_pass
 
-    logger = logging.getLogger("torch.export")  # prints the traceback of a damaged file
-    was_disabled, logger.disabled = logger.disabled, True
     try:
         loaded = torch.export.load(path)
     except Exception as error:
         raise PolicyError(
             "is damaged, or was not saved by torch.export.save of this PyTorch; save it again"
         ) from error
-    finally:
-        logger.disabled = was_disabled
     # Moving only the module would not change the devices that are written in its graph.
     program = move_to_device_pass(loaded, task.device).module()
     return lambda maps: program(*(maps[name] for name in task.representations)).argmax(-1)

@@ -9,11 +9,9 @@ from __future__ import annotations
 import json
 import os
 import platform
-import re
 import shutil
 import subprocess
 import uuid
-import zipfile
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -49,8 +47,6 @@ from flowrep.files import (
     refuse_link,
     replace_file,
     replace_text,
-    set_aside,
-    whole_number,
     write_rows,
 )
 
@@ -69,7 +65,6 @@ class FolderInUseError(OSError):
 
 DRIVES = "drives.npz"
 _TIMES = ("started", "ended")
-_MOST_BYTES = 2**30  # of unpacked drives: 2,000 bytes each for half a million episodes
 
 _IDENTITY = (
     "scene", "representations", "flow", "motion", "noise", "algorithm", "speed", "seed", "num_envs",
@@ -155,17 +150,13 @@ def read_drives(path: Path) -> dict[EpisodeKey, tuple[str, NDArray[np.float32]]]
     if not path.is_file():
         return {}
     try:
-        with zipfile.ZipFile(path) as archive:
-            size = sum(part.file_size for part in archive.infolist())
-        if size > _MOST_BYTES:
-            raise ValueError(f"holds {size:,} bytes, more than {_MOST_BYTES:,}")
         with np.load(path, allow_pickle=False) as saved:
             names = zip(*(saved[column].tolist() for column in EpisodeKey._fields), strict=True)
             positions = np.split(saved["positions"].reshape(-1, 2), saved["starts"][1:-1])
             driven = zip(saved["outcome"].tolist(), positions, strict=True)
             return dict(zip(map(EpisodeKey._make, names), driven, strict=True))
     except Exception as error:  # zip, zlib and numpy fail on garbage in a dozen ways
-        raise TableError(f"{path}: {error}") from error
+        raise TableError(f"{path} is damaged ({error}): restore or remove it") from error
 
 
 class Loggers:
@@ -178,15 +169,12 @@ class Loggers:
 
     def log(self, frames: int, values: Mapping[str, float]) -> None:
         """Logs values by title."""
-        events = self._folder / "tensorboard"
-        if not events.is_dir():  # new, or somebody removed it, so that the old writer would fail
-            self._tensorboard = None
-        with naming(events):
+        with naming(self._folder / "tensorboard"):
             if self._tensorboard is None:
                 # Imports PyTorch, before which commands open their folders.
                 from torchrl.record.loggers import TensorboardLogger
 
-                self._tensorboard = TensorboardLogger(events.name, str(self._folder))
+                self._tensorboard = TensorboardLogger("tensorboard", str(self._folder))
             for logger in filter(None, (self._tensorboard, self._wandb)):
                 logger.log_metrics(dict(values), frames)
 
@@ -220,8 +208,6 @@ class Loggers:
         if not kept.is_file():
             replace_text(kept, uuid.uuid4().hex[:12])
         name = kept.read_text(encoding="utf-8")
-        if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name):  # it becomes a part of paths
-            raise UsageError(f"{kept} does not hold a wandb run's id: restore or remove it")
 
         from torchrl.record.loggers.wandb import WandbLogger
 
@@ -286,6 +272,7 @@ class RunFolder:
         `patience_s` to release the folder.
         """
         self.path.mkdir(parents=True, exist_ok=True)
+        # In a stranger's folder: TensorBoard, wandb and FFmpeg would write through them.
         for name in (".lock", "checkpoint", "tensorboard", "videos", "wandb", ".hydra"):
             refuse_link(self.path / name)
         lock = FileLock(self.path / ".lock")
@@ -307,7 +294,6 @@ class RunFolder:
 
     def begin(self, config: TrainConfig, overrides: Iterable[str]) -> None:
         """Writes a new run's config and overrides."""
-        self.check_is_new()
         (self.path / ".hydra").mkdir(parents=True, exist_ok=True)  # where Hydra keeps the overrides
         typed = yaml.safe_dump(list(overrides), allow_unicode=True)
         replace_text(self.path / ".hydra" / "overrides.yaml", typed)
@@ -348,11 +334,9 @@ class RunFolder:
         if path.is_file():
             try:
                 machines = json.loads(path.read_text(encoding="utf-8"))
-                if not (isinstance(machines, list) and all(isinstance(m, dict) for m in machines)):
-                    raise ValueError("no list of machines")
-            except (ValueError, RecursionError) as error:
-                set_aside(path, error)
-                machines = []
+            except ValueError as error:
+                raise RunFolderError(f"{path} is damaged ({error}): restore or remove it") from None
+        # Called at each save, so that a run that is killed has an `ended` close to its end.
         entry = {**machine, "started": now, "ended": now}
         if machines and machines[-1] == entry | {k: machines[-1].get(k) for k in _TIMES}:
             entry["started"] = machines.pop()["started"] or now
@@ -390,7 +374,7 @@ class RunFolder:
 
     def read_metrics(self) -> list[dict[str, str]]:
         """Returns the rows of metrics.csv, none if there is no such file."""
-        return read_rows(self.metrics_path, ["frames"], {"frames": whole_number})
+        return read_rows(self.metrics_path, ["frames"], {"frames": int})
 
     def read_episodes(self) -> list[dict[str, str]]:
         """Returns the rows of evaluation.csv, none if there is no such file."""
@@ -419,16 +403,13 @@ class RunFolder:
 
     def _save_drives(self, records: Iterable[EpisodeRecord]) -> None:
         """Adds the vehicles' positions to drives.npz; they replace those of the same episodes."""
-        try:
-            drives = read_drives(self.drives_path)
-        except TableError as error:
-            set_aside(self.drives_path, error.__cause__)
-            drives = {}
+        drives = read_drives(self.drives_path)
         for each in records:
             drives[each.key] = each.outcome, each.positions
         outcomes, positions = zip(*drives.values())
         arrays: dict[str, Any] = dict(zip(EpisodeKey._fields, map(np.array, zip(*drives))))
         arrays["outcome"], arrays["positions"] = np.array(outcomes), np.concatenate(positions)
         arrays["starts"] = np.cumsum([0, *map(len, positions)])
+        # Ragged tracks as one flat array: an array of objects would need pickle to be read.
         with replace_file(self.drives_path) as partial:
             np.savez_compressed(partial, **arrays)

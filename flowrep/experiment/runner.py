@@ -176,6 +176,7 @@ class Runner:
         else:
             evaluation = PairedEvaluation([config.speed], [fps], asked.episodes, FIRST_SEEDS[kind])
         driver = Driver(self.agent.policy, config, self.frames)
+        # The training's generator stays where it is, so that evaluating more often changes no run.
         with self.clock("evaluation"), torch.random.fork_rng(devices=[]):
             num_envs = max(EVALUATION_ENVS, config.num_envs)
             evaluation.run(driver.make_env, driver.policy, num_envs, stop=stop)
@@ -237,7 +238,6 @@ class Runner:
         device = self.agent.device
         if getattr(config.algorithm, "precision", None) == "bf16" and not has_bf16(device):
             print(f"note: this run computes in bf16, which this machine's {device.type} emulates")
-        self.env.reset()
         state = load_checkpoint(path)
         try:
             check_origin(state["origin"], origin_of(config.plain()), path)

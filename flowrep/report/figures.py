@@ -204,6 +204,7 @@ def _bars(axes: Axes, grid: SuccessGrid) -> None:
             style = {"facecolor": look.colour, "hatch": look.hatch, "edgecolor": edge}
             axes.bar(at, height, 0.92 * width, linewidth=0, **style)
             axes.errorbar(at, height, lengths, color=_TEXT, linewidth=0.9, **_CAPS)
+            # The seeds stand beside the whisker: on it, a dot would hide the interval's ends.
             if len(cell.rates) > 1:
                 dots = (100 * cell.rates).tolist()
                 ring: Any = {"facecolor": "white", "edgecolor": _TEXT, "linewidth": 0.5}

@@ -17,7 +17,6 @@ from flowrep.report.sections import Report
 from flowrep.report.tables import listed
 from flowrep.scenes import SceneError, load_scene
 from flowrep.scenes.layout import Layout
-from flowrep.viz import OUTCOME_COLOURS
 from flowrep.viz.plan import Track, draw_plan
 
 TEMPLATES = Environment(
@@ -100,7 +99,8 @@ def tracks_of(run: Run, count: int) -> list[Track]:
     for drive, (outcome, positions) in drives.items():
         as_trained = ("greedy", run.speed, run.fps) == (drive.policy, drive.speed, drive.fps)
         is_final = drive.evaluation != "training" and drive.frames >= run.total_frames
-        if as_trained and is_final and drive.scene_id in here and outcome in OUTCOME_COLOURS:
+        if as_trained and is_final and drive.scene_id in here:
+            # By seed, as two evaluations may have driven the same episode.
             tracks[drive.episode_seed] = Track(positions.astype(float), outcome)
     return [tracks[seed] for seed in sorted(tracks)[:count]]
 

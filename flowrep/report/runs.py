@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrep.config.options import SpeedMode
-from flowrep.experiment.outcomes import EVALUATION_COLUMNS, OUTCOMES, EpisodeRecord
+from flowrep.experiment.outcomes import EVALUATION_COLUMNS, EpisodeRecord
 from flowrep.experiment.run import RunFolder, RunFolderError, flattened, origin_of
 from flowrep.files import TableError
 from flowrep.report.statistics import Array, Estimate, mean_share
@@ -148,15 +148,8 @@ def read_run(path: Path) -> Run:
 def episode_columns(cells: Cells) -> Columns:
     """Returns the columns of evaluation.csv that a report reads, "" for missing ones."""
     empty = [""] * len(cells.get("frames", ()))
-    columns: Columns = {
-        name: np.array(cells.get(name, empty), kind) for name, kind in EPISODE_COLUMNS.items()
-    }
-    # A misspelt "success" would count as a failure.
-    unknown = {*columns["outcome"].tolist()} - {*OUTCOMES}
-    if unknown:
-        names = ", ".join(map(repr, sorted(unknown)))
-        raise ValueError(f"unknown outcome {names} of an episode; known: {', '.join(OUTCOMES)}")
-    return columns
+    kinds = EPISODE_COLUMNS.items()
+    return {name: np.array(cells.get(name, empty), kind) for name, kind in kinds}
 
 
 def metric_columns(cells: Cells) -> Columns:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from matplotlib.figure import Figure
 
 from flowrep.config.cli import line_for
-from flowrep.files import refuse_link, replace_files
+from flowrep.files import refuse_link, replace_bytes, replace_text
 from flowrep.report.figures import draw_bars, draw_curves, draw_rates, encoded, words
 from flowrep.report.runs import (
     COMPLEMENTARY_STACKS,
@@ -100,14 +100,12 @@ def write_files(report: Report, folder: Path) -> list[Path]:
     folders = [folder / section.folder for section in report.sections]
     for section, path in zip(report.sections, folders):
         refuse_link(path).mkdir(exist_ok=True)
-        files: dict[str, bytes] = {}
         if section.figure:
             for kind in ("png", "pdf"):
-                files[f"{section.name}.{kind}"] = encoded(section.figure, kind)
+                replace_bytes(path / f"{section.name}.{kind}", encoded(section.figure, kind))
         for table in section.tables:
-            files[f"{table.name}.tex"] = table.to_latex().encode()
-            files[f"{table.name}.csv"] = table.to_csv().encode()
-        replace_files(path, files)
+            replace_text(path / f"{table.name}.tex", table.to_latex())
+            replace_text(path / f"{table.name}.csv", table.to_csv())
     return folders
 
 

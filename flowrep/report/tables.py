@@ -2,7 +2,6 @@
 
 import csv
 import io
-import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -11,7 +10,6 @@ import numpy as np
 from flowrep.report.statistics import Estimate
 
 MISSING = "missing"
-_NUMBERS = re.compile(r"[-+−0-9.,–\[\] ]+")
 _LATEX: dict[str, str] = {character: rf"\{character}" for character in "&%$#_{}"} | {
     "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
     "–": "--", "−": "$-$", "×": r"$\times$", "→": r"$\to$", "∞": r"$\infty$", "≥": r"$\ge$",
@@ -61,14 +59,8 @@ class Table(NamedTuple):
         writer = csv.writer(text, lineterminator="\n")
         first = 0 if any(heading for heading, _ in self.blocks) else 1
         for heading, rows in (("group", (self.header,)), *self.blocks):
-            writer.writerows(map(_without_formula, (heading, *row)[first:]) for row in rows)
+            writer.writerows((heading, *row)[first:] for row in rows)
         return text.getvalue()
-
-
-def _without_formula(cell: str) -> str:
-    # Spreadsheets evaluate a cell that begins like a formula, such as a folder named "=1+1".
-    begins = cell.startswith(("=", "+", "-", "@", "\t", "\r"))
-    return f"'{cell}" if begins and not _NUMBERS.fullmatch(cell) else cell
 
 
 def latex_text(text: str) -> str:

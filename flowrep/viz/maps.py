@@ -198,9 +198,9 @@ def representation_strip(
         {tile.label: tile.draw(maps[name]) for name, tile in shown.items()},
         wheel_for=[tile.label for tile in shown.values() if tile.is_flow],
         notes={tile.label: tile.note for tile in shown.values() if tile.note},
-        framed=[tile.label for name, tile in shown.items() if name in _listed(framed)],
+        framed=[tile.label for name, tile in shown.items() if name in framed],
     )
-    return np.concatenate([drawn, class_legend(_listed(categories), drawn.shape[1])])
+    return np.concatenate([drawn, class_legend(tuple(categories), drawn.shape[1])])
 
 
 @lru_cache(maxsize=64)
@@ -233,7 +233,7 @@ def depth_bar(range_m: float, width: int) -> Image:
 def strip(
     images: Mapping[str, Image],
     *,
-    wheel_for: Iterable[str] = (),
+    wheel_for: Collection[str] = (),
     notes: Mapping[str, Note] = MappingProxyType({}),
     framed: Collection[str] = (),
 ) -> Image:
@@ -257,11 +257,10 @@ def strip(
         raise ValueError(f"a strip needs images of one ratio of height to width, got {sizes}")
     zoom = tile_zoom(height, width)
     height, width = zoom * height, zoom * width
-    with_wheel, framed = _listed(wheel_for), _listed(framed)
     columns: list[Image] = []
     for label, image in images.items():
         title = text_bar(label, width, _BAR_PX, size=18).copy()
-        if label in with_wheel and width >= _BAR_PX:
+        if label in wheel_for and width >= _BAR_PX:
             title[1 : _BAR_PX - 1, -_BAR_PX:-2] = flow_wheel(_BAR_PX - 2)
         column = [title, resized(image, height, width)]
         if notes.keys() & images.keys():  # below all labels, so that all images stand level
@@ -335,11 +334,6 @@ def written(image: Image, texts: Mapping[tuple[int, int], tuple[Any, ...]], *, s
     for position, (text, anchor, colour) in texts.items():
         draw.text(position, text, fill=colour, font=font, anchor=anchor)
     return np.array(picture)
-
-
-def _listed(names: str | Iterable[str]) -> tuple[str, ...]:
-    """Returns names as a tuple; a text is a single name."""
-    return (names,) if isinstance(names, str) else tuple(names)
 
 
 def _picture(rgb: Any) -> Image:

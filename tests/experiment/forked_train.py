@@ -22,9 +22,9 @@ from pathlib import Path
 import matplotlib.pyplot  # noqa: F401
 import torch.utils.tensorboard  # noqa: F401
 
-import flowrep.agent.checkpoint as checkpoint
-import flowrep.files as files
 import flowrep.train
+from flowrep import files
+from flowrep.agent import checkpoint
 from flowrep.experiment.run import RunFolder
 from flowrep.experiment.schema import validated_run
 
@@ -40,9 +40,9 @@ def half_a_file(tensors, file, **_):
 
 def killed_at(stage: str, save: int) -> None:
     """Arranges that the process kills itself in that stage of writing its nth checkpoint."""
-    steps = {"write": "save_file", "half": "save_file", "flush": "_flush"}
-    name, left = steps.get(stage, "_rename"), [save]
-    module = checkpoint if name == "save_file" else files
+    write, rename = (checkpoint, "save_file"), (os, "replace")
+    steps = {"write": write, "half": write, "flush": (files, "_flush")}
+    (module, name), left = steps.get(stage, rename), [save]
     whole = getattr(module, name)
 
     def counted(*arguments, **options):

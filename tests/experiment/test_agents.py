@@ -14,7 +14,7 @@ from flowrep.agent import CheckpointError, save_checkpoint
 from flowrep.config import group_choices
 from flowrep.config.usage import UsageError
 from flowrep.experiment.agents import Agent
-from flowrep.experiment.policies import PRETRAINED, packed, unpacked
+from flowrep.experiment.policies import PRETRAINED
 from flowrep.experiment.run import RunFolder
 from flowrep.scenes import load_scene
 from tests.comparing import differing
@@ -250,19 +250,6 @@ def test_every_scene_has_one_of_at_most_three_megabytes():
     sizes = {path.stem: path.stat().st_size for path in PRETRAINED.glob("*.safetensors")}
     assert sorted(sizes) == SCENES
     assert max(sizes.values()) <= 3_000_000  # 1.7 MB for two maps of 60 × 60, 2.6 MB for three
-
-
-def test_rows_keep_their_largest_weight_exactly_and_others_to_half_a_step():
-    weights = {
-        "filters": torch.tensor([[[2.54, -0.013]], [[0.0, 0.0]]]),
-        "bias": torch.tensor([0.3]),
-    }
-    found = unpacked(packed(weights))
-    # a step of the first row is 2.54 / 127 = 0.02: -0.013 becomes -0.02, by truncation it were 0
-    torch.testing.assert_close(
-        found["filters"], torch.tensor([[[2.54, -0.02]], [[0.0, 0.0]]]), rtol=0, atol=1e-6
-    )
-    assert torch.equal(found["bias"], weights["bias"])
 
 
 @pytest.mark.parametrize("scene", [pytest.param(s, marks=pytest.mark.slow) for s in SCENES])

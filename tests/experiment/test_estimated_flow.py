@@ -41,13 +41,6 @@ def test_with_the_camera_compensated_what_stands_still_has_hardly_any_object_flo
     assert moved[exact > 0.5].median() > 0.5
 
 
-def test_estimated_flow_has_the_size_of_the_maps_whatever_that_of_the_pictures():
-    env = make_env("straight_road", ["raw", "depth"], flow="estimated", picture_scale=2)
-    specs = env.observation_spec
-    env.close()
-    assert specs["raw"].shape[-2:] == specs["depth"].shape[-2:]
-
-
 @pytest.mark.parametrize("picture_scale", [1, 2])
 def test_the_agent_is_given_an_estimate_of_pictures_of_that_size(picture_scale):
     flow = {"source": "estimated", "picture_scale": picture_scale}

@@ -13,8 +13,6 @@ from flowrep.transforms import Depth
 from flowrep.viz import OUTCOME_COLOURS
 from tests.config.composing import composed
 
-FRAME_COLOUR = (230, 97, 1)
-
 
 def leave_the_road(tensordict):
     return tensordict.set("action", torch.ones(len(tensordict), dtype=torch.int64))
@@ -111,27 +109,6 @@ def test_filming_does_not_change_what_the_agent_estimates(film_of):
 def test_the_picture_is_as_large_as_a_tile_unless_it_is_read(film_of, representation, flow, rgb):
     film = film_of(f"representations=[{representation}]", f"flow={flow}")
     assert film.env.observation_spec["sensor", "rgb"].shape == (1, 3, *rgb)
-
-
-def columns_of(picture, colour):
-    """Returns in which columns of a picture a colour fills most rows: upright lines."""
-    is_it = (np.abs(picture.astype(int) - colour) <= 2).all(-1)
-    return np.flatnonzero(is_it[:200].mean(axis=0) > 0.95)
-
-
-def test_maps_that_the_agent_reads_have_a_frame_and_a_baseline_reads_none(film_of):
-    film = film_of("representations=[ego]")
-    frames, _ = film.drive({"episode_seed": 3})
-    picture = film.draw(frames[0])
-    left, right = columns_of(picture, FRAME_COLOUR)[[0, -1]]
-    # six tiles of 240 px, with 5 px around each and 4 px between: ego is the fifth
-    assert left == 4 * (240 + 10 + 4)
-    assert right - left + 1 == 250
-    scene = composed("debug=smoke").scene
-    with_planner = Film(Agent.load("planner", scene=scene, device="cpu"))
-    frames, _ = with_planner.drive({"episode_seed": 3})
-    assert not columns_of(with_planner.draw(frames[0]), FRAME_COLOUR).size
-    with_planner.close()
 
 
 def test_the_last_picture_shows_the_outcome_in_its_colour(film_of):

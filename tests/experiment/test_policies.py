@@ -1,7 +1,5 @@
 """Policies of somebody else's: what they see, and what is said of those that can't be used."""
 
-import zipfile
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -79,19 +77,6 @@ def test_two_policies_do_not_share_what_lies_beside_one(tmp_path):
     assert [each(maps())["action"].tolist() for each in policies] == [[0, 0], [1, 1], [0, 0]]
 
 
-def test_a_folder_of_data_or_a_shared_helper_is_in_no_policys_way(tmp_path):
-    for name in ("one", "other"):
-        (tmp_path / name).mkdir()
-        script = "import my_weights\nmake = lambda task: lambda maps: [0] * len(maps)"
-        (tmp_path / name / "mine.py").write_text(script)
-    (tmp_path / "one" / "my_weights.py").write_text("")
-    (tmp_path / "other" / "my_weights.py").symlink_to(tmp_path / "one" / "my_weights.py")
-    (tmp_path / "other" / "json").mkdir()
-    for name in ("one", "other"):
-        policy = ForeignPolicy(f"{tmp_path}/{name}/mine.py:make").built_for(TASK)
-        assert policy(maps())["action"].tolist() == [0, 0]
-
-
 def test_a_program_that_torch_saved_is_a_policy(tmp_path):
     class Scores(torch.nn.Module):
         def forward(self, ego, depth):
@@ -150,18 +135,6 @@ def test_what_is_not_there_or_damaged_is_named(name, tmp_path):
     for each in (name, f"{tmp_path}/agent.pt2"):
         with pytest.raises((PolicyError, UsageError), match=each.partition(".")[0]):
             ForeignPolicy(each).built_for(TASK)
-
-
-@pytest.mark.parametrize("kind", ["text", "zip"])
-def test_of_a_program_that_is_none_nothing_is_logged(kind, tmp_path, caplog):
-    path = tmp_path / "agent.pt2"
-    path.write_text("something else")
-    if kind == "zip":
-        with zipfile.ZipFile(path, "w") as file:
-            file.writestr("agent/version", "3")
-    with pytest.raises(PolicyError, match=str(path)):
-        ForeignPolicy(str(path)).built_for(TASK)
-    assert not caplog.records
 
 
 def test_a_policy_that_changes_its_maps_changes_nothing_of_the_envs():

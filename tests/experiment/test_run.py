@@ -4,7 +4,6 @@ import copy
 import json
 import multiprocessing
 import pickle
-import shutil
 import sys
 import time
 from datetime import UTC, datetime
@@ -98,12 +97,6 @@ def test_an_edited_config_is_refused_by_the_name_of_the_key(config, place, value
         check_origin(origin_of(config), origin_of(edited), PATH)
 
 
-def test_a_run_from_before_scenes_said_whether_they_are_symmetric_is_the_same(config):
-    assert config["scene"]["symmetric"]
-    scene = {key: value for key, value in config["scene"].items() if key != "symmetric"}
-    check_origin(origin_of(config | {"scene": scene}), origin_of(config), PATH)
-
-
 def test_another_version_is_refused(config):
     with pytest.raises(CheckpointError, match=r"0\.0\.9"):
         check_origin(origin_of(config) | {"flowrep": "0.0.9"}, origin_of(config), PATH)
@@ -131,9 +124,6 @@ def test_offline_runs_are_kept_in_the_folder_and_go_on_under_the_same_name(tmp_p
     assert names == [(tmp_path / "wandb_id").read_text()] * 2
     assert list((tmp_path / "wandb").glob(f"offline-run-*/run-{names[0]}.wandb"))
     assert (tmp_path / "metrics.csv").read_text().splitlines()[1:] == ["10,0.1", "20,0.05"]
-
-
-CONFIG = {"representations": {"ego": None}, "flow": {"source": "exact"}, "seed": 3}
 
 
 def test_metrics_and_means_of_evaluations_go_to_tensorboard(tmp_path):
@@ -270,46 +260,21 @@ def test_a_folder_that_holds_a_run_is_no_place_for_a_new_one(tmp_path, name):
         run.check_is_new()
 
 
-def test_an_episode_that_is_evaluated_again_replaces_its_row(tmp_path):
-    run = RunFolder(tmp_path)
-    run.log_episodes([episode(7), episode(8), episode(9)])
-    before = run.evaluation_path.read_bytes()
-    run.log_episodes([episode(8), episode(9)])
-    assert run.evaluation_path.read_bytes() == before
-    run.log_episodes([episode(8, "timeout")])
-    run.log_episodes([episode(8, evaluation="final")])
-    rows = [(row["episode_seed"], row["evaluation"], row["outcome"]) for row in run.read_episodes()]
-    assert sorted(rows) == [
-        ("7", "", "collision"), ("8", "", "timeout"), ("8", "final", "collision"),
-        ("9", "", "collision"),
-    ]  # fmt: skip
-
-
 @pytest.mark.parametrize("there", [[], [2], [3, 4], [1, 2, 3, 4]])
 def test_an_evaluation_run_again_leaves_the_table_of_one_that_was_never_stopped(tmp_path, there):
-    whole, stopped = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "stopped")
-    for run in (whole, stopped):
-        run.path.mkdir()
-        run.save_episodes([episode(seed, evaluation="training") for seed in (8, 9)])
-    stopped.save_episodes([episode(seed, evaluation="final") for seed in there])
-    for run in (whole, stopped):
-        run.save_episodes([episode(seed, evaluation="final") for seed in (1, 2, 3, 4)])
-    assert stopped.evaluation_path.read_bytes() == whole.evaluation_path.read_bytes()
-    assert [row["episode_seed"] for row in whole.read_episodes()] == [*"891234"]
+    run = RunFolder(tmp_path)
+    run.save_episodes([episode(seed, evaluation="training") for seed in (3, 9)])
+    run.save_episodes([episode(seed, "timeout", evaluation="final") for seed in there])
+    run.save_episodes([episode(seed, evaluation="final") for seed in (1, 2, 3, 4)])
+    assert [row["episode_seed"] for row in run.read_episodes()] == [*"391234"]
+    assert {row["outcome"] for row in run.read_episodes()} == {"collision"}
 
 
 HEADER = ",".join(EVALUATION_COLUMNS)
 ROW = ",".join(cells(episode(1)).values())
 DAMAGED = {
-    **{
-        f"{cell}": f"{HEADER}\n{','.join(cells(episode(1), **cell).values())}\n"
-        for cell in (
-            {"frames": "1O"},
-            {"frames": 26 * "9"},
-            {"length": 401 * "9"},
-            {"fps": "1e999"},
-        )
-    },
+    "no number": f"{HEADER}\n{','.join(cells(episode(1), frames='1O').values())}\n",
+    "no outcome": f"{HEADER}\n{ROW.replace('collision', 'succesr')}\n",
     "semicolons": f"{HEADER}\n{ROW}\n".replace(",", ";"),
     "a column less": f"{HEADER.replace(',hit', '')}\n{ROW.rpartition(',')[0]}\n",
     "a short row": f"{HEADER}\n{ROW}\n{ROW.rpartition(',')[0]}\n",
@@ -335,13 +300,6 @@ def test_a_table_from_before_a_column_is_read_with_empty_cells_and_goes_on(tmp_p
     assert [row["path"] for row in run.read_episodes()] == ["", "left"]
 
 
-def test_a_cell_that_can_not_be_is_named_with_its_row(tmp_path):
-    run = RunFolder(tmp_path)
-    run.evaluation_path.write_text(f"{HEADER}\n{ROW}\n{ROW.replace('collision', 'succesr')}\n")
-    with pytest.raises(TableError, match=r"evaluation\.csv.*outcome.*'succesr'.* 2\b"):
-        run.read_episodes()
-
-
 # Drives are pictures' data; what they cost must not be the episodes.
 
 
@@ -350,55 +308,17 @@ def drives(run):
     return {drive.episode_seed: (outcome, points.tolist()) for drive, (outcome, points) in saved}
 
 
-def without(run, name):
-    with np.load(run.drives_path) as saved:
-        kept = {key: saved[key] for key in saved if key != name}
-    np.savez_compressed(run.drives_path, **kept)
-
-
-def flip(run, place, bit=16):
-    data = bytearray(run.drives_path.read_bytes())
-    data[place] ^= bit
-    run.drives_path.write_bytes(data)
-
-
-DAMAGES = {
-    "empty": lambda run: run.drives_path.write_bytes(b""),
-    "text": lambda run: run.drives_path.write_text("something else"),
-    "cut": lambda run: run.drives_path.write_bytes(run.drives_path.read_bytes()[:-40]),
-    "a pickle": lambda run: run.drives_path.write_bytes(pickle.dumps({"a": 1})),
-    "no column": lambda run: without(run, "outcome"),
-    "no positions": lambda run: without(run, "positions"),
-    # of the first file in the zip: flags (encrypted), method of compression, and its contents
-    "a flag": lambda run: flip(run, run.drives_path.read_bytes().index(b"PK\x01\x02") + 8, 1),
-    "a method": lambda run: flip(run, run.drives_path.read_bytes().index(b"PK\x01\x02") + 10),
-    "a bit": lambda run: flip(run, 80),
-}
-
-
-@pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
-def test_damaged_drives_cost_no_episode_and_are_set_aside(tmp_path, capsys, damage):
+def test_damaged_drives_cost_no_episode_and_stay_as_they_are(tmp_path):
     run = RunFolder(tmp_path)
     run.log_episodes([episode(1)], drives=True)
-    damage(run)
-    before = run.drives_path.read_bytes()
-    capsys.readouterr()
-    run.log_episodes([episode(2, positions=2 * ROAD)], drives=True)
+    whole = run.drives_path.read_bytes()
+    flipped = whole[:80] + bytes([whole[80] ^ 16]) + whole[81:]
+    for damaged in (b"", b"something else", whole[:-40], pickle.dumps({"a": 1}), flipped):
+        run.drives_path.write_bytes(damaged)
+        with pytest.raises(TableError, match=r"drives\.npz.*remove it"):
+            run.log_episodes([episode(2)], drives=True)
+        assert run.drives_path.read_bytes() == damaged
     assert [row["episode_seed"] for row in run.read_episodes()] == ["1", "2"]
-    assert drives(run) == {2: ("collision", (2 * ROAD).tolist())}
-    (aside,) = (path for path in tmp_path.glob("drives*") if path != run.drives_path)
-    assert aside.read_bytes() == before
-    (said,) = capsys.readouterr().err.splitlines()
-    assert str(run.drives_path) in said
-    assert aside.name in said
-
-
-def test_drives_that_would_fill_the_memory_are_damaged(tmp_path, monkeypatch):
-    run = RunFolder(tmp_path)
-    run.log_episodes([episode(1)], drives=True)
-    monkeypatch.setattr("flowrep.experiment.run._MOST_BYTES", 1_000)
-    with pytest.raises(TableError, match=r"drives\.npz"):
-        read_drives(run.drives_path)
 
 
 def test_whole_drives_are_added_to(tmp_path):
@@ -421,26 +341,3 @@ def test_episodes_are_saved_before_their_drives(tmp_path, monkeypatch):
     with pytest.raises(OSError, match=r"drives\.npz"):
         run.log_episodes([episode(1)], drives=True)
     assert len(run.read_episodes()) == 1
-
-
-@pytest.mark.parametrize("text", ["[{", "", "{}", "[null]", "\x00", "[" * 20_000])
-def test_a_damaged_list_of_machines_is_set_aside(tmp_path, capsys, text):
-    (tmp_path / "machine.json").write_text(text)
-    RunFolder(tmp_path).note_machine({"cpu": "x"})
-    (noted,) = json.loads((tmp_path / "machine.json").read_text())
-    assert noted["cpu"] == "x"
-    assert str(tmp_path / "machine.json") in capsys.readouterr().err
-    assert len(list(tmp_path.iterdir())) == 2
-
-
-def test_a_run_goes_on_where_its_tensorboard_is_removed(tmp_path):
-    run = RunFolder(tmp_path)
-    for frames in range(30):
-        if frames == 10:
-            shutil.rmtree(tmp_path / "tensorboard")
-        run.log_metrics(frames, {f"metric{k}": float(frames) for k in range(20)})
-        run.loggers.flush()
-    events = EventAccumulator(str(next(tmp_path.rglob("events.out.tfevents.*"))))
-    events.Reload()
-    assert [event.step for event in events.Scalars("metric3")] == list(range(10, 30))
-    assert len(run.read_metrics()) == 30

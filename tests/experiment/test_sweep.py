@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from flowrep import sweep
-from flowrep.config import CONF_DIR, cli, group_choices
+from flowrep.config import cli, group_choices
 from flowrep.config.usage import UsageError
 from flowrep.experiment.outcomes import EVALUATION_COLUMNS, is_finished
 from flowrep.experiment.schema import TrainConfig
@@ -19,16 +19,9 @@ from flowrep.files import open_to_append, read_rows, write_rows
 from tests.config.composing import composed, plain
 
 
-@pytest.mark.parametrize(
-    ("line", "expected"),
-    [
-        ("-m seed=0,1", True),
-        ("hydra.mode=MULTIRUN seed=0,1", True),
-        ("seed=0", False),
-    ],
-)
-def test_several_runs_are_asked_for_in_hydras_ways(line, expected):
-    assert sweep.is_sweep(line.split()) is expected
+def test_several_runs_are_asked_for_in_hydras_ways():
+    lines = ("-m seed=0,1", "hydra.mode=MULTIRUN seed=0,1", "seed=0")
+    assert [sweep.is_sweep(line.split()) for line in lines] == [True, True, False]
 
 
 # What is done of one run, whose final evaluation is one episode of each of four policies.
@@ -220,10 +213,3 @@ def test_an_interrupted_sweep_goes_on_and_a_failed_run_stops_no_other(tmp_path):
     rows = read_rows(whole / "metrics.csv")
     assert [int(row["frames"]) for row in rows] == list(range(20, 241, 20))
     assert (whole / "job.log").read_text().count("run folder: ") == 2  # begun, and resumed
-
-
-def test_ray_can_join_a_cluster():
-    # The plugin sets object_store_memory unless the key is there, and Ray refuses any value but
-    # None when it joins a cluster.
-    launcher = yaml.safe_load((CONF_DIR / "hydra/launcher/ray_jobs.yaml").read_text("utf-8"))
-    assert launcher["ray"]["init"]["object_store_memory"] is None

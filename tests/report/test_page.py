@@ -213,16 +213,6 @@ def test_a_run_whose_scene_is_unknown_is_a_line_and_the_others_have_their_plan(t
     assert "paths" in warning
 
 
-def test_drives_with_an_unknown_outcome_or_of_another_shape_are_not_drawn(tmp_path):
-    run = run_in(tmp_path, "run", "sco")
-    write_drives(run, outcome=np.array(["success", "won", "crash"]))
-    (track,) = tracks_of(read_run(run), 3)
-    assert track.outcome == "success"
-    for changes in ({"positions": np.zeros(5)}, {"starts": np.array([0])}):
-        write_drives(run, **changes)
-        assert tracks_of(read_run(run), 3) == []
-
-
 @pytest.mark.parametrize("linked", ["film", "folder"])
 def test_a_film_that_lies_outside_of_the_run_is_not_embedded(tmp_path, linked):
     (tmp_path / "elsewhere").mkdir()

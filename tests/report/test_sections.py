@@ -1,6 +1,5 @@
 """Sections of runs whose every number is worked by hand."""
 
-import csv
 import math
 import re
 from functools import partial
@@ -238,20 +237,3 @@ def test_a_table_is_latex_that_compiles_and_csv_that_reads():
     assert r"    \multicolumn{2}{l}{\textit{S-Turn}} \\" in latex
     assert r"    c & $-$3 \\" in latex
     assert table.to_csv() == ("group,what,value (%)\nS-Turn,a_b,85 [79–90]\n,c,−3\n")
-
-
-@pytest.mark.parametrize(
-    ("cell", "written"),
-    [
-        ("=HYPERLINK(1)", "'=HYPERLINK(1)"),
-        ("@SUM(1)", "'@SUM(1)"),
-        ("-2+cmd|x", "'-2+cmd|x"),
-        ("+12 [−3, +20]", "+12 [−3, +20]"),  # a number of the report's
-        ("a=b", "a=b"),
-    ],
-)
-def test_a_spreadsheet_computes_nothing_of_a_name(cell, written):
-    table = Table("t", "", ("=head", "what"), ((cell, ((cell, "1"),)),))
-    ((head, *_), (heading, name, _)) = csv.reader(table.to_csv().splitlines())
-    assert (head, heading, name) == ("group", written, written)
-    assert "'=head" in table.to_csv()

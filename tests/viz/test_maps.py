@@ -148,15 +148,6 @@ def test_only_the_named_maps_have_a_frame():
     assert not orange[:, :-170].any()
 
 
-def test_a_single_name_works_like_a_list_of_one():
-    shown = {"raw": np.zeros((20, 30, 3), np.uint8), "aw": np.zeros((20, 30, 3), np.uint8)}
-    for option in ("wheel_for", "framed"):
-        image = viz.strip(shown, **{option: "raw"})
-        np.testing.assert_array_equal(image, viz.strip(shown, **{option: ["raw"]}))
-    one, listed = (viz.representation_strip(maps(), categories=c) for c in ("road", ["road"]))
-    np.testing.assert_array_equal(one, listed)
-
-
 def test_a_grey_map_is_black_at_its_low_end_and_white_at_its_high_end():
     values = np.array([[[-3.0, -1.0, 0.0, 3.0, 9.0, np.nan]]])
     # 0 is a quarter of the way from -1 to 3
