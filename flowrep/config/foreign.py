@@ -71,11 +71,12 @@ def _plain(config: Any) -> dict[Any, Any]:
 
 def _outside(group: str, package: str | None, content: dict[Any, Any], ours: dict[Any, Any]) -> str:
     """Returns what a file does outside of its group, "" if it stays in it."""
-    section = group.replace("/", ".")
-    is_whole = group.partition("/")[0] in _WHOLE
-    may_be = "_global_|(?!hydra$)[a-z_]+" if is_whole else "(?!hydra)" + re.escape(section)
-    if not re.fullmatch(may_be, package or section or "_global_"):
-        return f"sets keys of {package or section}, which is not its group"
+    section = group.partition("/")[0]  # a section's group may have folders
+    package = package or group.replace("/", ".") or "_global_"
+    is_whole = section in _WHOLE
+    may_be = "_global_|(?!hydra$)[a-z_]+" if is_whole else rf"(?!hydra){re.escape(section)}(\.\w+)*"
+    if not re.fullmatch(may_be, package):
+        return f"sets keys of {package}, which is not its group"
     defaults = content.get("defaults")
     for entry in defaults if isinstance(defaults, list) else ():
         name = " ".join(map(str, entry)) if isinstance(entry, dict) else str(entry)

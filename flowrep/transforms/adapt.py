@@ -10,7 +10,6 @@ from typing import Any, Literal, TypeAlias
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import dispatch
 from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 
@@ -145,11 +144,13 @@ class AdaptPose(MapTransform):
         """Returns the pose, unchecked."""
         return (geometry.adapt_pose(pose, check=False, **self.options),)
 
-    def _refuse_ill_formed(self, tensordict: TensorDictBase, rows: Tensor | None = None) -> None:
+    def _check_values(self, tensordict: TensorDictBase, rows: Tensor | None = None) -> None:
         """Raises ValueError for an ill-formed pose, in the given rows `[*B]` or in all."""
         if not self.check or tensordict.get(self.in_keys[0], None) is None:
             return
         (pose,) = self._inputs(tensordict)
+        if not base.has_values(pose):
+            return
         own_dims = len(self.reads[0].shape)
         are_bodies = pose.ndim > tensordict.ndim + own_dims
         pose = pose if rows is None else pose[rows]
@@ -167,14 +168,8 @@ class AdaptPose(MapTransform):
     ) -> TensorDictBase:
         reset = tensordict.get("_reset", None)
         rows = None if reset is None else flags_of_batch(reset, tensordict)
-        self._refuse_ill_formed(tensordict_reset, rows)
+        self._check_values(tensordict_reset, rows)
         return super()._reset(tensordict, tensordict_reset)
-
-    @dispatch(source="in_keys", dest="out_keys", auto_batch_size=False)
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the poses of a batch of any shape, at its root and under `"next"`."""
-        self._refuse_ill_formed(tensordict)
-        return super().forward(tensordict)
 
     def output_specs(self, pose: TensorSpec) -> tuple[TensorSpec]:
         """Returns an unbounded float64 spec."""

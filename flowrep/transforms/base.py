@@ -192,6 +192,9 @@ class MapTransform(Transform):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
+        # Loops that read no specs don't call `transform_input_spec`.
+        if self.container is not None and not torch.compiler.is_compiling():
+            self._check_steps(self._of_its_env())
         # TorchRL's `_reset` doesn't call the transform.
         begins = tensordict.get("_reset", None)
         if begins is None:
@@ -222,7 +225,8 @@ class MapTransform(Transform):
         `"next"` is left unchanged if it holds none of the inputs, for example in a buffer that
         stores only the reward there.
         """
-        self._check_values(tensordict)
+        if not torch.compiler.is_compiling():
+            self._check_values(tensordict)
         tensordict = self._call(tensordict)
         following = tensordict.get("next", None)
         if following is not None and any(key in following.keys(True) for key in self.in_keys):
@@ -263,7 +267,7 @@ class MapTransform(Transform):
         ]
         if not of_env:
             return
-        steppers = [type(x).__name__ for x in transforms if _methods_that_step(x)]
+        steppers = [type(x).__name__ for x in transforms if _methods_that_step(x.__class__)]
         if self.container.base_env.__dict__.get("wrapper_frame_skip", 1) > 1:
             steppers.append("frame_skip")
         if steppers:
@@ -410,7 +414,7 @@ class RecurrentTransform(MapTransform):
                     f"{type(self).__name__}, an earlier transform, reads again at the next step: "
                     "let it write to another key, or put it first"
                 )
-            if "_reset" in _methods_that_step(transform):
+            if "_reset" in _methods_that_step(transform.__class__):
                 raise ValueError(
                     f"{type(transform).__name__} steps the env at a reset, and what "
                     f"{type(self).__name__}, an earlier transform, writes is that of its last "
@@ -450,7 +454,8 @@ def flags_of_batch(flags: Tensor, tensordict: TensorDictBase) -> Tensor:
     return flags.flatten(batch_dims).any(-1) if flags.ndim > batch_dims else flags
 
 
-def _methods_that_step(transform: Transform) -> set[str]:
+@functools.cache
+def _methods_that_step(kind: type[Transform]) -> set[str]:
     """Returns the names of a transform's methods that step its env, such as TorchRL's frame skip.
 
     TorchRL has no flag for it. But a transform reaches its env as its `parent`, so a method's code
@@ -458,7 +463,7 @@ def _methods_that_step(transform: Transform) -> set[str]:
     """
     code = {
         name: {*inspect.unwrap(method).__code__.co_names}
-        for each in reversed(type(transform).__mro__)
+        for each in reversed(kind.__mro__)
         if each not in Transform.__mro__
         for name, method in vars(each).items()
         if inspect.isfunction(method)
@@ -480,6 +485,11 @@ def check_unconverted(key: NestedKey, before: Tensor, now: Tensor) -> None:
             f"{key!r} of the previous step is {before.dtype}, and that of this step {now.dtype}: "
             "what converts it afterwards has to write to another key"
         )
+
+
+def has_values(x: Tensor) -> bool:
+    """Returns whether a check may read values: meta tensors and compiled code have none."""
+    return not (x.is_meta or torch.compiler.is_compiling())
 
 
 def signed(dtype: torch.dtype) -> torch.dtype:

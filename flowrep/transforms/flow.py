@@ -104,13 +104,12 @@ class CameraTransform(MapTransform):
         return maps
 
     def _check_values(self, tensordict: TensorDictBase, *, waits: bool = False) -> None:
-        if not self.camera_keys or torch.compiler.is_compiling():
-            return
-        if any(tensordict.get(key, None) is None for key in self.in_keys):
+        lacks = (tensordict.get(key, None) is None for key in self.in_keys)
+        if not self.camera_keys or any(lacks):
             return
         maps = self._inputs(tensordict)
         for key, K in zip(self.camera_keys, maps[-len(self.camera_keys) :]):
-            if K.is_cpu or (waits and not K.is_meta):
+            if base.has_values(K) and (waits or K.is_cpu):
                 size = _map_size(maps, self.reads)
                 geometry.check_intrinsics(f"key {key!r}", K, size, allow_unknown=True)
 

@@ -21,6 +21,7 @@ from flowrep.transforms.base import (
     Keys,
     MapTransform,
     check_distinct_keys,
+    has_values,
     signed,
 )
 
@@ -248,7 +249,7 @@ class InstanceIds(MapTransform):
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         next_tensordict = super()._call(next_tensordict)
         ids = next_tensordict.get(self.in_keys[0], None)
-        if ids is None or torch.compiler.is_compiling():
+        if ids is None or not has_values(ids):
             return next_tensordict
         self._calls_to_skip -= 1
         if self._calls_to_skip < 0:
@@ -294,6 +295,9 @@ class InstanceIds(MapTransform):
 def _check_bytes(values: Tensor, what: str, remedy: str) -> None:
     """Raises ValueError for whole numbers that would wrap in uint8, as 300 would become 44."""
     if values.dtype is torch.uint8 or not values.numel():
+        return
+    if not has_values(values):  # compiled code can't branch on them
+        torch._assert_async(((values >= 0) & (values <= 255)).all(), f"{what} beyond 0 to 255")
         return
     least, most = (int(bound) for bound in values.aminmax())
     if least < 0 or most > 255:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from flowrep.config import cli
+from flowrep.config import CONF_DIR, cli
 from flowrep.config.usage import UsageError
 from tests.config.conftest import SCHEMAS
 
@@ -21,6 +21,8 @@ REFUSED = {
     "a group of Hydra's": ("hydra/launcher", "_target_: os.system"),
     "a class": ("algorithm", "defaults: [dqn, _self_]\n_target_: mine.A"),
 }  # fmt: skip
+
+COPY = (CONF_DIR / "scene/s_turn.yaml").read_text("utf-8").replace("steps: 250", "steps: 1.5")
 
 
 def written(folder, group, text):
@@ -46,10 +48,13 @@ def test_a_file_that_leaves_its_group_is_refused_before_anything_runs(run, tmp_p
     ("group", "text", "key"),
     [
         ("scene", "defaults: [s_turn, _self_]\nname: mine\ntime_limit_steps: ${.lanes}", "lanes"),
+        ("scene/city", f"# @package scene\n{COPY}", "time_limit_steps"),
         ("preset", f"{WHOLE}defaults: [laptop, {{override /algorithm: dqn}}]\nseed: 7", ""),
         ("experiment", f"{WHOLE}seed: 7\nhydra: {{sweeper: {{params: {{scene: s_turn}}}}}}", ""),
     ],
 )
 def test_a_file_may_set_what_its_group_is_for(run, tmp_path, group, text, key):
-    _, found, said = run("train", "--config-dir", str(tmp_path), written(tmp_path, group, text))
+    written(tmp_path, group, text)
+    choice = "=".join(f"{group}/mine".split("/", 1))  # scene=city/mine
+    _, found, said = run("train", "--config-dir", str(tmp_path), choice)
     assert key in said.err if key else found[0].seed == 7

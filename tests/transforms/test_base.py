@@ -169,7 +169,7 @@ def by_poses() -> list[Transform]:
 def test_the_motion_of_the_envs_last_step_is_refused_where_others_step_it(make, is_first):
     parts = [make(), *by_motions()] if is_first else [*by_motions(), make()]
     with pytest.raises(ValueError, match=r"'prev_from_curr'.*steps.*poses.*CameraMotion"):
-        TransformedEnv(FakeSensorEnv(), Compose(*parts)).rollout(1)
+        TransformedEnv(FakeSensorEnv(), Compose(*parts)).reset()  # as a loop that reads no specs
 
 
 @pytest.mark.parametrize("is_first", [True, False])
@@ -185,7 +185,7 @@ def test_poses_give_the_flow_between_two_observations_though_a_frame_lies_betwee
 def test_what_steps_the_env_at_a_reset_comes_before_what_compares_steps():
     env = TransformedEnv(FakeSensorEnv(), Compose(*by_poses(), noop()))
     with pytest.raises(ValueError, match=r"NoopResetEnv.*CameraMotion.*put it first"):
-        env.rollout(1)
+        env.reset()
 
 
 def test_all_that_is_computed_from_a_first_frame_is_what_a_reset_would_give():

@@ -134,6 +134,27 @@ def test_compiled_exported_and_on_meta_tensors_whether_it_was_called_before(make
     assert all(each.is_meta for each in used.to("meta")(*(x.to("meta") for x in given)))
 
 
+CHECKED = {
+    "AdaptPose": (T.AdaptPose(in_keys="x"), torch.eye(4)),
+    "InstanceIds": (T.InstanceIds([3], in_keys="x"), torch.tensor([[[3, 0, 3]]])),
+    "Segmentation": (T.Segmentation(3, in_keys="x"), torch.tensor([[[2, 0, 255]]])),
+}
+
+
+@pytest.mark.parametrize(("transform", "given"), CHECKED.values(), ids=list(CHECKED))
+def test_what_checks_values_is_one_graph_too_and_runs_without_values(transform, given):
+    (key,), given = transform.out_keys, TensorDict(x=given)
+    compiled = torch.compile(transform, fullgraph=True, backend="eager")
+    assert torch.equal(compiled(given.clone())[key], transform(given.clone())[key])
+    assert transform.to("meta")(given.to("meta"))[key].is_meta
+
+
+def test_compiled_code_refuses_class_ids_that_would_wrap_too():
+    wrong = TensorDict(x=torch.tensor([[[300]]]))
+    with pytest.raises(RuntimeError, match="beyond 0 to 255"):
+        torch.compile(T.Segmentation(3, in_keys="x"), fullgraph=True, backend="eager")(wrong)
+
+
 @pytest.mark.slow
 def test_inductor_compiles_two_transforms_into_one_graph():
     torch.compiler.reset()
