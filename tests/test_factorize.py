@@ -340,10 +340,7 @@ def test_a_file_that_is_typed_has_to_be_there(moments, tmp_path, monkeypatch, ca
     assert "error: format.times: there is no file" in capsys.readouterr().err
 
 
-EXPECTED = {
-    "frames": "depth/*, ", "tum": "depth.txt", "sevenscenes": "*.pose.txt", "replica": "traj.txt",
-    "kitti": "image_2",
-}  # fmt: skip
+EXPECTED = {"frames": "depth/*, ", "tum": "depth.txt", "kitti": "image_2"}
 
 
 @pytest.mark.parametrize("format", EXPECTED)

@@ -25,7 +25,7 @@ CAMERA = (31.0, 27.0, 18.5, 13.0)
 open_sevenscenes = opener("sevenscenes", depth_intrinsics=CAMERA, intrinsics=CAMERA)
 open_sintel = opener("sintel", scene="cave", backwards=True)
 OPENCV = OPENCV_INTRINSICS
-open_tum = opener("tum", intrinsics=OPENCV)
+open_tum, open_realsense = (opener(name, intrinsics=OPENCV) for name in ("tum", "realsense"))
 open_icl_nuim = opener("icl_nuim", poses="livingRoom2.gt.freiburg", intrinsics=OPENCV)
 
 # Format: how it is written, how it is opened, whether it has flow of its own, whether time runs
@@ -46,13 +46,7 @@ DECLARED = {
     "icl_nuim": (synthetic.write_icl_nuim, open_icl_nuim, False, False, 0),
     "replica": (synthetic.write_replica, opener("replica", intrinsics=OPENCV), False, False, 0),
     "scannet": (synthetic.write_scannet, opener("scannet"), False, False, 0),
-    "realsense": (
-        synthetic.write_realsense,
-        opener("realsense", intrinsics=OPENCV),
-        False,
-        False,
-        0,
-    ),
+    "realsense": (synthetic.write_realsense, open_realsense, False, False, 0),
     "kubric": (synthetic.write_kubric, opener("kubric"), True, False, 1e-3),
 }
 CAMERAS = {
