@@ -5,7 +5,7 @@ from __future__ import annotations
 import uuid
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, Literal, TypeAlias
+from typing import Any, TypeAlias
 
 from flowrep.extras import require
 
@@ -62,7 +62,6 @@ class BulletCamera:
             Without it, each call needs a view.
         link: (body, link) on which the camera is mounted, link -1 for the base. `view` is then in
             the axes of the URDF's link; without it, the camera looks along z, and y is down.
-        instances: `"links"`, or `"bodies"` for one row per body, which must have no moving joints.
         max_instances: the number of rows for bodies and links that exist at the same time.
         classes: class ids by body; other bodies, and the sky, are 0.
         rgb: whether to return the picture.
@@ -104,15 +103,12 @@ class BulletCamera:
         far_m: float | None = None,
         view: View | Callable[[], View] | None = None,
         link: tuple[int, int] | None = None,
-        instances: Literal["links", "bodies"] = "links",
         max_instances: int = 64,
         classes: Mapping[int, int] | None = None,
         rgb: bool = False,
         renderer: int = pybullet.ER_TINY_RENDERER,
         **picture: Any,
     ) -> None:
-        if instances not in ("links", "bodies"):
-            raise ValueError(f"instances must be 'links' or 'bodies', got {instances!r}")
         if not 1 <= max_instances < 1 << 15:
             raise ValueError(f"max_instances must be 1 to {(1 << 15) - 1}, got {max_instances}")
         self._client = _Client(client) if isinstance(client, int) else client
@@ -133,8 +129,7 @@ class BulletCamera:
         self._picture["flags"] = self._picture.get("flags", 0) | flags
         self.K, self._range_m = self._intrinsics(np.array(projection, dtype=np.float32))
         self._view, self._link = view, link
-        self._has_links, self.max_instances = instances == "links", max_instances
-        self._classes, self._has_rgb = classes, rgb
+        self.max_instances, self._classes, self._has_rgb = max_instances, classes, rgb
         self._instance_type = np.uint8 if max_instances < 256 else np.int16
         self.rows: dict[tuple[int, int], int] = {}
         self._bodies: dict[str, _Body] = {}  # by tag
@@ -155,8 +150,6 @@ class BulletCamera:
         bodies = self._existing()
         poses = {tag: body.poses(self._client) for tag, body in bodies.items()}  # [1 + links, 4, 4]
         world_from_cam = self._pose(view, bodies, poses)
-        if not self._has_links:
-            poses = {tag: pose[:1] for tag, pose in poses.items()}
         row_of = self._rows(poses)
         self.rows = {(bodies[tag].number, link): row for (tag, link), row in row_of.items()}
         now = np.full((self.max_instances, 4, 4), np.nan)
@@ -217,11 +210,6 @@ class BulletCamera:
                 key = client.addUserData(number, _TAG, uuid.uuid4().hex)
             tag = client.getUserData(key).decode()
             bodies[tag] = self._bodies.get(tag) or _Body(client, number)
-            if bodies[tag].joints and not self._has_links:
-                raise ValueError(
-                    f"body {number} ({bodies[tag].name}) has joints, so that its links move "
-                    "apart: use instances='links'"
-                )
         self._bodies = bodies
         return bodies
 
@@ -276,8 +264,11 @@ class BulletCamera:
         # Ids are body + ((link + 1) << 24); the sky's -1 would be body 0xffffff, link 254.
         packed = np.where(is_sky, 0, ids).view(np.uint32)
         body, link = packed & 0xFFFFFF, packed >> 24
-        rows = self._table(int(body.max()), int(link.max()))
-        instance = rows[body, link] if self._has_links else rows[body, 0]
+        table = np.full((1 + int(body.max()), 1 + int(link.max())), -1)  # of rows; link 0: the base
+        for (of, joined), row in self.rows.items():
+            if of < len(table) and 1 + joined < table.shape[1]:
+                table[of, 1 + joined] = row
+        instance = table[body, link]
         instance[is_sky] = 0
         if (instance < 0).any():
             unknown = sorted({int(number) for number in body[instance < 0]})
@@ -294,14 +285,6 @@ class BulletCamera:
             colours = np.asarray(rgba, dtype=np.uint8).reshape(*shape, 4)[..., :3]
             maps["rgb"] = np.ascontiguousarray(colours.transpose(2, 0, 1))
         return maps
-
-    def _table(self, most_body: int, most_link: int) -> Array:
-        """Returns the row by body and 1 + link, -1 for those that don't exist."""
-        table = np.full((1 + most_body, 1 + most_link), -1, dtype=np.int32)
-        for (body, link), row in self.rows.items():
-            if body <= most_body and link < most_link:
-                table[body, 1 + link] = row
-        return table
 
 
 class BulletFlow(gym.Wrapper):
@@ -391,11 +374,10 @@ class _Body:
 
     def __init__(self, client: Any, number: int) -> None:
         self.number = number
-        self.name = client.getBodyInfo(number)[1].decode()
         base = client.getDynamicsInfo(number, -1)
         if base[10] == _RIGID and len(client.getVisualShapeData(number)) > 1:
             raise ValueError(
-                f"body {number} ({self.name}) was loaded with useMaximalCoordinates: PyBullet "
+                f"body {number} was loaded with useMaximalCoordinates: PyBullet "
                 "draws its links under one id and doesn't report their poses; load it without"
             )
         self.is_soft = base[10] == _SOFT

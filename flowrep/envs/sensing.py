@@ -1,13 +1,14 @@
 """What a street's camera observes: maps, and motions of camera and bodies since the last step."""
 
 from collections.abc import Sequence, Set
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, get_args
 from weakref import WeakValueDictionary
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from flowrep.config.options import Renderer
 from flowrep.scenes.pedestrians import PARTS, world_from_parts
 from flowrep.scenes.scene import MOST_PX, num_classes
 from flowrep.simulator import camera
@@ -42,8 +43,10 @@ class Sensing:
             raise ValueError(
                 f"picture_scale must be a whole number from 1 to {most}, got {scale!r}"
             )
+        if renderer not in (known := get_args(Renderer)):
+            raise ValueError(f"unknown renderer {renderer!r}; choose one of {', '.join(known)}")
         names = (sensors,) if isinstance(sensors, str) else tuple(sensors)
-        key = street, names, renderer, scale
+        key = street, names, "rasteriser" if renderer == "auto" else renderer, scale
         sensing = _SHARED.get(key)
         if sensing is None:
             sensing = _SHARED[key] = cls(*key)
@@ -62,7 +65,7 @@ class Sensing:
         self._projection = camera.gl_projection(*pinhole, *self._range_m)
         self._vehicle_from_cam = camera.vehicle_from_camera(config)
         self._ids_by_number = street.ids_by_number()
-        self.renderer, self._scale = camera.choose_renderer(renderer), scale
+        self.renderer, self._scale = renderer, scale
         if scale != 1 and self.renderer == "pybullet":
             remedy = "needs renderer 'rasteriser'; give 1 with 'pybullet'"
             raise ValueError(f"picture_scale={scale} {remedy}")

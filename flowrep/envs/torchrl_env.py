@@ -20,7 +20,6 @@ from flowrep.geometry.checks import checked_count
 from flowrep.scenes.load import load_scene
 from flowrep.scenes.scene import Range, Scene, num_classes
 from flowrep.scenes.vehicle import YAW_SIGN
-from flowrep.simulator.camera import choose_renderer
 from flowrep.transforms import Mirror, representation_stack
 from flowrep.transforms.base import as_keys
 from flowrep.transforms.stack import FLOWS, DropKeys, Representations
@@ -141,7 +140,7 @@ def make_env(
     if isinstance(flow, Mapping) and flow.get("source") == "estimated":
         flow = {"picture_scale": picture_scale, **flow}
         picture_scale = flow["picture_scale"]
-    drawn: Any = {"renderer": choose_renderer(renderer), "picture_scale": picture_scale}
+    drawn: Any = {"renderer": renderer, "picture_scale": picture_scale}
     street = partial(StreetEnv, loaded, speed, frame_rate_hz, **drawn)
     frame_rate_hz = checked_frame_rate(loaded, frame_rate_hz)
     transforms = Compose()

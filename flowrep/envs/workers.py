@@ -1,7 +1,6 @@
 """Envs stepped in parallel by several processes, several envs in each."""
 
 import os
-import pickle
 import signal
 import sys
 import time
@@ -22,7 +21,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import batch_space, create_shared_memory, read_from_shared_memory
 from numpy.typing import NDArray
 
-from flowrep.progress import STOP_SIGNALS, StopRequest
+from flowrep.progress import STOP_SIGNALS
 
 Arrays = dict[str, Any]  # arrays, nested like a Dict space
 EnvFactory = Callable[[], gym.Env]
@@ -34,8 +33,6 @@ _SIDE_BY_SIDE = partial(SyncVectorEnv, copy=False, autoreset_mode=AutoresetMode.
 PATIENCE_S = 300.0
 """How long a worker may take to answer: it starts in seconds and steps in milliseconds, but the
 machine may be busy."""
-PATIENCE_AFTER_STOP_S = 10.0
-"""The same after a signal to stop, as SIGKILL may follow soon."""
 PATIENCE_AT_THE_END_S = 5.0
 """How long workers may take to end before they are killed."""
 
@@ -66,7 +63,7 @@ class WorkerVectorEnv(VectorEnv):
         in_each: makes a vector env without autoreset from the envs of one worker.
 
     Raises:
-        ValueError: there are more workers than envs, or a factory can't be pickled.
+        ValueError: there are more workers than envs.
         WorkerError: a worker could not start; any method raises it if a worker has ended or does
             not answer.
     """
@@ -108,14 +105,7 @@ class WorkerVectorEnv(VectorEnv):
             memory = create_shared_memory(space, self.num_envs, context)
             for rows in self._rows:
                 arguments = env_factories[rows], memory, self.num_envs, in_each
-                try:
-                    self._workers.append(_Worker(context, rows, *arguments))
-                except (pickle.PicklingError, AttributeError, TypeError) as error:
-                    raise ValueError(
-                        f"the factory of an env can't be sent to a worker process ({error}): "
-                        "define it at the top of a module that can be imported, not in the script "
-                        "that is run, or step it in this process"
-                    ) from error
+                self._workers.append(_Worker(context, rows, *arguments))
         self._shared: Any = read_from_shared_memory(space, memory, self.num_envs)
         for worker in self._workers:
             worker.receive()
@@ -213,15 +203,12 @@ class _Worker:
         return result
 
     def _receive_within_patience(self) -> Any:
-        begun = time.monotonic()
-        while not self.pipe.poll(1.0):
-            waited = time.monotonic() - begun
-            if waited > (PATIENCE_AFTER_STOP_S if StopRequest.was_received else PATIENCE_S):
-                pid = self.process.pid
-                raise WorkerError(
-                    f"the worker process of {self.name} has not answered for {waited:.0f} s: if "
-                    f"process {pid} is suspended, resume it with 'kill -CONT {pid}'"
-                )
+        if not self.pipe.poll(PATIENCE_S):
+            pid = self.process.pid
+            raise WorkerError(
+                f"the worker process of {self.name} has not answered for {PATIENCE_S:g} s: if "
+                f"process {pid} is suspended, resume it with 'kill -CONT {pid}'"
+            )
         return self.pipe.recv()
 
     def _talk(self, act: Callable[..., Any], *args: Any) -> Any:
@@ -229,12 +216,9 @@ class _Worker:
             return act(*args)
         except (EOFError, OSError) as error:
             self.process.join(timeout=1.0)
-            code = self.process.exitcode
-            why = "perhaps the system killed it because memory ran out"
-            if code != -signal.SIGKILL:
-                why = "its last output says why"
             raise WorkerError(
-                f"the worker process of {self.name} is gone (exit code {code}): {why}"
+                f"the worker process of {self.name} is gone (exit code {self.process.exitcode}): "
+                "its last output says why; after -9, perhaps memory ran out"
             ) from error
 
 

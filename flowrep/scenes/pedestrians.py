@@ -49,16 +49,6 @@ def world_from_parts(poses: Array) -> Array:
     return transforms.reshape(*poses.shape[:-2], -1, 4, 4)
 
 
-def quaternions_of_parts(poses: Array) -> Array:
-    """Returns the rotations of `world_from_parts` as quaternions [3·P, 4], x, y, z, w."""
-    _, _, yaw, swing = poses.T[..., None]
-    sine_z, cosine_z = np.sin(yaw / 2), np.cos(yaw / 2)
-    half = np.concatenate([np.zeros_like(swing), 0.5 * swing * _SIDES], axis=-1)
-    sine_y, cosine_y = np.sin(half), np.cos(half)
-    quaternions = [-sine_z * sine_y, cosine_z * sine_y, sine_z * cosine_y, cosine_z * cosine_y]
-    return np.stack(quaternions, axis=-1).reshape(-1, 4)
-
-
 def keeps_its_stretches(points: Array, aside_m: float) -> bool:
     """Returns whether no stretch of a line vanishes or reverses when the line is moved aside."""
     # A stretch's length is linear in `aside_m`, so what holds at two distances holds in between.

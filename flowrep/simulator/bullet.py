@@ -110,11 +110,17 @@ class Simulator:
 
     def place(self, body: int, x_m: float, y_m: float, yaw_rad: float, z_m: float = 0.0) -> None:
         """Places a body at a planar pose."""
-        self.place_at(body, (x_m, y_m, z_m), _about_z(yaw_rad))
+        place = (x_m, y_m, z_m), _about_z(yaw_rad)
+        pybullet.resetBasePositionAndOrientation(body, *place, self._client)
 
-    def place_at(self, body: int, xyz_m: Sequence[float], rotation_xyzw: Sequence[float]) -> None:
-        """Places a body anywhere."""
-        pybullet.resetBasePositionAndOrientation(body, xyz_m, rotation_xyzw, self._client)
+    def place_at(self, body: int, world_from_body: NDArray[np.float64]) -> None:
+        """Places a body anywhere, turned by Rz(yaw) · Ry(pitch)."""
+        yaw = math.atan2(-world_from_body[0, 1], world_from_body[1, 1])
+        pitch = math.atan2(-world_from_body[2, 0], world_from_body[2, 2])
+        turn = pybullet.getQuaternionFromEuler([0.0, pitch, yaw])
+        pybullet.resetBasePositionAndOrientation(
+            body, world_from_body[:3, 3].tolist(), turn, self._client
+        )
 
     def touch(self, body: int, other: int) -> bool:
         """Returns whether two bodies overlap at their current poses."""

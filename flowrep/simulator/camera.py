@@ -1,4 +1,4 @@
-"""The simulated pinhole camera: intrinsics, OpenGL matrices, depth in metres, choice of renderer.
+"""The simulated pinhole camera: intrinsics, OpenGL matrices, depth in metres.
 
 Convention: camera axes are OpenCV's (x right, y down, z forward), pixel (0, 0)'s centre is
 (0.5, 0.5), depth is metres along z.
@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrep.config.options import PRINCIPAL_POINT_SHIFT_PX, Renderer
+from flowrep.config.options import PRINCIPAL_POINT_SHIFT_PX
 from flowrep.simulator.motion import rigid_inverse
 
 if TYPE_CHECKING:  # scenes need shapely and pydantic, which `flowrep.pybullet` shouldn't import
@@ -79,10 +79,3 @@ def depth_from_zbuffer(
     # is exact in float32.
     gap = (np.float32(1.0) - zbuffer) * np.float32(far_m - near_m) + np.float32(near_m)
     return np.float32(far_m * near_m) / gap
-
-
-def choose_renderer(name: str) -> str:
-    """Returns "rasteriser" or "pybullet"; "auto" is the rasteriser."""
-    if name not in (known := get_args(Renderer)):
-        raise ValueError(f"unknown renderer {name!r}; choose one of {', '.join(known)}")
-    return "rasteriser" if name == "auto" else name

@@ -115,11 +115,10 @@ class Street:
 
     def place_pedestrians(self, poses: Array) -> None:
         """Places people at poses [P, 4], for a picture."""
-        positions = pedestrians.world_from_parts(poses)[:, :3, 3]
-        parts = self._numbers[len(self._numbers) - len(positions) :]  # the bodies added last
-        rotations = pedestrians.quaternions_of_parts(poses)
-        for part, position, rotation in zip(parts, positions.tolist(), rotations.tolist()):
-            self.simulator.place_at(part, position, rotation)
+        transforms = pedestrians.world_from_parts(poses)
+        parts = self._numbers[len(self._numbers) - len(transforms) :]  # the bodies added last
+        for part, transform in zip(parts, transforms):
+            self.simulator.place_at(part, transform)
 
     def is_anyone_near(self, track: Sequence[VehicleState], poses: Array) -> Array:
         """Returns at which of T times a person, at poses [T, P, 4], is within touching distance."""

@@ -14,7 +14,6 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from flowrep.envs import WorkerError, WorkerVectorEnv, workers
-from flowrep.progress import StopRequest
 from tests.comparing import differing
 
 pytestmark = pytest.mark.slow
@@ -139,35 +138,6 @@ def test_an_error_names_the_envs_of_a_worker_that_failed_or_was_killed(make, act
         env.step(np.array([1, 1, 1, 1]))
 
 
-class EndsWhatUnpicklesIt:
-    def __call__(self):
-        return Counter()
-
-    def __reduce__(self):
-        return os._exit, (3,)
-
-
-def test_an_error_has_the_exit_code_of_a_worker_that_ended():
-    with pytest.raises(WorkerError, match=r"exit code 3\)") as caught:
-        WorkerVectorEnv([EndsWhatUnpicklesIt()] * 2, 2)
-    assert "memory" not in str(caught.value)
-
-
-@pytest.mark.parametrize("how", ["lambda", "local class", "open file"])
-def test_a_factory_that_can_not_be_pickled_is_refused(how, tmp_path):
-    class Local(Counter):
-        pass
-
-    with (tmp_path / "file").open("w") as file:
-        factory = {
-            "lambda": lambda: Counter(),
-            "local class": Local,
-            "open file": partial(Counter, number=file),
-        }[how]
-        with pytest.raises(ValueError, match=r"module that can be imported"):
-            WorkerVectorEnv([factory, factory], 2)
-
-
 def test_the_answer_to_an_interrupted_call_is_discarded(make):
     env, other = make(3, 2), in_process(3)
     for each in (env, other):
@@ -192,20 +162,15 @@ def test_workers_block_stop_signals_from_their_start(make):
     assert not signal.pthread_sigmask(signal.SIG_BLOCK, ()) & asked
 
 
-@pytest.mark.parametrize("is_asked_to_stop", [False, True])
-def test_a_suspended_worker_is_named_and_killed(make, monkeypatch, is_asked_to_stop):
-    short = "PATIENCE_AFTER_STOP_S" if is_asked_to_stop else "PATIENCE_S"
+def test_a_suspended_worker_is_named_and_killed(make, monkeypatch):
     env = make(4, 2)
     env.reset(seed=0)
     process = env._workers[1].process
     os.kill(process.pid, signal.SIGSTOP)
-    monkeypatch.setattr(workers, short, 0.5)
+    monkeypatch.setattr(workers, "PATIENCE_S", 0.5)
     monkeypatch.setattr(workers, "PATIENCE_AT_THE_END_S", 0.5)
-    with StopRequest():
-        if is_asked_to_stop:
-            os.kill(os.getpid(), signal.SIGTERM)
-        with pytest.raises(WorkerError, match=rf"environments 2 to 3 .*CONT {process.pid}'"):
-            env.step(np.array([1, 1, 1, 1]))
+    with pytest.raises(WorkerError, match=rf"environments 2 to 3 .*CONT {process.pid}'"):
+        env.step(np.array([1, 1, 1, 1]))
     env.close()
     assert process.exitcode == -signal.SIGKILL
 

@@ -16,7 +16,6 @@ from flowrep.scenes.pedestrians import (
     draw_lanes,
     keeps_its_stretches,
     keeps_lanes_apart,
-    quaternions_of_parts,
     world_from_parts,
 )
 from flowrep.scenes.scene import PedestrianGroup, Walk
@@ -71,18 +70,6 @@ def test_people_look_where_they_walk_and_turn_about_at_the_ends(crowd):
     assert looks(2.8, 1) == pytest.approx(0.0)  # +x, round the corner
 
 
-def test_a_standing_person_keeps_exactly_the_same_pose(crowd):
-    first = crowd.poses(0.0)[2]
-    for time_s in (0.1, 1 / 3, 7.7):
-        assert np.array_equal(crowd.poses(time_s)[2], first)
-
-
-def test_poses_at_many_times_equal_single_calls(crowd):
-    times = np.array([0.0, 0.7, 3.3, 12.1])
-    for method in (crowd.positions, crowd.poses):
-        np.testing.assert_array_equal(method(times[:, None]), [method(time_s) for time_s in times])
-
-
 def test_a_scene_may_be_without_people():
     empty = Crowd([], np.zeros(0), np.zeros(0))
     assert empty.poses(1.0).shape == (0, 4)
@@ -124,17 +111,6 @@ def test_a_leg_swings_back_while_the_other_swings_forward_and_the_body_only_turn
     height = HIP_M - LEG_M * math.cos(math.radians(30.0))
     np.testing.assert_allclose((left @ foot)[:3], [4.9, 2.0 - 0.41, height], atol=1e-12)
     np.testing.assert_allclose((right @ foot)[:3], [5.1, 2.0 + 0.41, height], atol=1e-12)
-
-
-def test_quaternions_are_the_matrices():
-    poses = np.array([*POSE, [1.0, -3.0, -2.0, -0.3]])
-    transforms = world_from_parts(poses)
-    for (x, y, z, w), transform in zip(quaternions_of_parts(poses), transforms, strict=True):
-        # Of a unit quaternion's matrix, the columns for x and z.
-        first = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
-        third = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]
-        np.testing.assert_allclose(transform[:3, 0], first, atol=1e-12)
-        np.testing.assert_allclose(transform[:3, 2], third, atol=1e-12)
 
 
 @pytest.mark.parametrize("swing", [0.0, 0.38, -0.38])
