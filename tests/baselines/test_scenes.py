@@ -4,7 +4,6 @@ Counts are small here; `examples/scene_validity.py` runs hundreds of episodes a 
 """
 
 from dataclasses import replace
-from itertools import repeat
 
 import gymnasium
 import numpy as np
@@ -129,23 +128,6 @@ def test_a_closed_exit_ends_the_drive_into_it(make_street, name, driven, path, c
     x, y = env.episode.now.vehicle[:2]
     front = Layout(env.scene).closures[closed].footprint.exterior.distance(shapely.Point(x, y))
     assert front < 0.5 * 2**0.5 + 1e-6
-
-
-@pytest.mark.slow_after_first
-@pytest.mark.parametrize(
-    ("path", "y_m"),
-    [
-        # From 9 m on along the western leg, which begins at y = -65, to the face of the house at
-        # 75 - 2.5 m, less the vehicle's front: 63 m; the 152nd look at 24 a second sees it touch.
-        ("south_to_north", -65.0 + 9.0 + 152 * 10 / 24),
-        # The same from the other end: from 121 to 55 + 2.5 m, again 63 m.
-        ("north_to_south", -65.0 + 121.0 - 152 * 10 / 24),
-    ],
-)
-def test_driving_straight_on_in_the_h_ends_at_a_house(make_street, path, y_m):
-    env = make_street(replace(load_scene("h_shaped_pathways"), pedestrian_groups=()), sensors=())
-    assert driven_to_its_end(env, repeat(0), path=path) == ("collision", "building")
-    assert env.episode.now.vehicle[:2] == pytest.approx((0.0, y_m), abs=1e-6)
 
 
 @pytest.mark.slow_after_first

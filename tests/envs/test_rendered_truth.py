@@ -93,30 +93,15 @@ def agreement(before, now):
     ]
 
 
-def totals(frames, change=lambda frame: frame):
-    frames = list(frames)
-    pairs = zip(frames[::2], frames[1::2])
-    return sum(torch.tensor(agreement(before, change(now))) for before, now in pairs)
-
-
 @pytest.mark.slow_after_first
 @pytest.mark.parametrize("name", scene_names())
 def test_each_pixel_is_found_where_its_flow_says_it_was(drive, name):
-    for agree, asked, seen in totals(drive(ACTIONS, name)):
+    frames = list(drive(ACTIONS, name))
+    pairs = zip(frames[::2], frames[1::2])
+    for agree, asked, seen in sum(torch.tensor(agreement(*pair)) for pair in pairs):
         assert asked > 500
         assert asked / seen > 0.3  # what is certain is no mere remnant
         assert agree / asked >= 0.99
-
-
-@pytest.mark.slow
-def test_pixels_of_people_need_the_motion_of_people(drive):
-    def without_own_motion(frame):
-        rows = frame["prev_from_curr"].expand_as(frame["instance_motion"])
-        return frame | {"instance_motion": rows}
-
-    (still, asked, _), (walking, asked_walking, _) = totals(drive(ACTIONS), without_own_motion)
-    assert still / asked >= 0.99
-    assert walking / asked_walking < 0.9
 
 
 def flows(frame):

@@ -21,12 +21,12 @@ from flowrep.envs import (
     get_states,
     has_spare_cores,
     make_env,
+    make_mirror,
     set_states,
     street_envs,
 )
 from flowrep.envs.sensing import SENSORS
 from flowrep.scenes import SceneError, load_scene
-from flowrep.scenes.scene import CATEGORY_ID
 from flowrep.transforms import Depth, FlowFactorize, RawFlow
 from tests.comparing import differing
 
@@ -204,50 +204,21 @@ def test_rendered_pictures_and_flow_estimator_have_the_same_scale(make):
         assert street.observation_space["rgb"].shape == (3, 168, 168)
 
 
-def test_options_of_a_representation_reach_its_transform(make):
-    plain = make(representations=["depth"], seed=0).reset()["depth"]
-    near = make(representations={"depth": {"range_m": 10.0}}, seed=0).reset()["depth"]
-    # Half the default range of 100 m in metres: what is 10 m away or more fills the short range.
-    assert (near[plain >= 0.1] == 1).all()
-    assert (near < 1).any()
-
-
 def test_an_env_that_ends_is_reset_alone(make):
     env = make(representations=["seg"], num_envs=3, seed=1)
     # The first turns off the road within 20 steps; the others go straight on.
-    actions = torch.tensor([[1, 0, 0]]).expand(30, 3)
-    steps, _ = play(env, actions)
-    ended = steps["next", "done"][:, :, 0]
-    first = int(ended[:, 0].nonzero()[0])
+    steps, _ = play(env, torch.tensor([[1, 0, 0]]).expand(30, 3))
+    first = int(steps["next", "done"][:, 0, 0].nonzero()[0])
     assert first < 20
-    assert steps["next", "outcome"][first, 0] == Outcome.OUT_OF_BOUNDS
-    assert steps["next", "terminated"][first, 0]
+    last, then = steps["next"][first], steps[first + 1]
+    assert last["outcome"][0] == Outcome.OUT_OF_BOUNDS
     assert not steps["next", "truncated"].any()
-    seeds = steps["episode_seed"][:, :, 0]
-    assert not ended[first, 1:].any()
-    assert seeds[first + 1, 0] != seeds[first, 0]
-    assert (seeds[first + 1, 1:] == seeds[first, 1:]).all()
-    # The new episode's first picture is its own, and it has not ended.
-    assert steps["outcome"][first + 1, 0] == Outcome.RUNNING
+    assert (then["episode_seed"] != last["episode_seed"])[:, 0].tolist() == [True, False, False]
+    # The new episode's first picture is its own; what the others see goes on.
     alone = make(representations=["seg"], num_envs=1)
-    begun = alone.reset(options={"episode_seed": int(seeds[first + 1, 0])})
-    assert torch.equal(begun["seg"][0], steps["seg"][first + 1, 0])
-    # What the others see goes on from the step before.
-    assert torch.equal(steps["seg"][first + 1, 1:], steps["next", "seg"][first, 1:])
-
-
-def test_noise_depends_on_the_episode_and_step_alone(make):
-    make = partial(make, representations=["depth2", "obj", "ego"], noise=NOISE)
-    actions = actions_of(3, 3)
-    many, _ = play(make(num_envs=3, seed=4), actions)
-    alone = make(num_envs=1, seed=77)
-    begun = alone.reset(options={"episode_seed": int(many["episode_seed"][0, 2])})
-    one, _ = play(alone, actions[:, 2:], begun)
-    for name in ("depth2", "obj", "ego"):
-        assert torch.equal(one["next", name][:, 0], many["next", name][:, 2]), name
-    holes = many["depth2"] == 0
-    assert not torch.equal(holes[:, 0], holes[:, 1])  # other episodes
-    assert not torch.equal(holes[1, :, 0], holes[1, :, 1])  # other steps of one
+    begun = alone.reset(options={"episode_seed": int(then["episode_seed"][0])})
+    assert torch.equal(begun["seg"][0], then["seg"][0])
+    assert torch.equal(then["seg"][1:], last["seg"][1:])
 
 
 @pytest.mark.slow
@@ -280,6 +251,19 @@ def test_public_names_are_imported_on_first_use():
         assert getattr(envs, name).__name__ == name
     with pytest.raises(AttributeError, match="no attribute 'make_envs'"):
         _ = envs.make_envs
+
+
+def test_the_mirror_of_a_scene_knows_its_flows_actions_and_camera():
+    mirror = make_mirror("straight_road", ["ego", "seg2"])
+    mirror.images = "all"
+    maps = {"ego": torch.randn(2, 84, 84), "seg2": torch.randint(5, (2, 84, 84))}
+    image = mirror(TensorDict(maps | {"action": torch.tensor(1)}))
+    # cx is 42.5, so that the image of column i is column 84 - i, and that of column 0 is not seen.
+    turned = torch.tensor([-1.0, 1.0])[:, None, None] * maps["ego"].flip(-1)
+    assert torch.equal(image["ego"][..., 1:], turned[..., :-1])
+    assert torch.equal(image["seg2"][..., 1:], maps["seg2"].flip(-1)[..., :-1])
+    assert image["action"] == 2
+    assert make_mirror("straight_road", "ego").flow_keys == ["ego"]
 
 
 def test_begin_step_does_not_change_the_step(make, in_workers):
@@ -343,14 +327,3 @@ def test_the_order_of_episodes_does_not_depend_on_the_policy(make):
     drawn = seeds(left)
     assert drawn == seeds(2 * left)
     assert drawn[0] != drawn[1]
-
-
-def test_hit_is_the_class_of_what_the_vehicle_hit(make):
-    env = make(representations=(), num_envs=3, seed=1)
-    steps, _ = play(env, torch.zeros(200, 3, dtype=torch.long))
-    outcome, hit = steps["next", "outcome"], steps["next", "hit"]
-    collided = outcome == Outcome.COLLISION
-    assert collided.any()
-    # Straight on, only people are in the way.
-    assert set(hit[collided].tolist()) == {CATEGORY_ID["pedestrian"]}
-    assert (hit[~collided] == 255).all()

@@ -2,7 +2,6 @@
 
 import gc
 import resource
-import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -12,19 +11,13 @@ import pytest
 from flowrep.envs import StreetEnv
 
 
-@pytest.fixture
-def own_scene(straight_road):
-    """A scene whose simulator no street of another test shares."""
-    gc.collect()  # so that no forgotten street is collected between two counts
-    return replace(straight_road, name="clients")
-
-
 def clients():
     return sum(bool(pybullet.isConnected(physicsClientId=i)) for i in range(100))
 
 
-def test_streets_of_one_scene_share_a_client_until_the_last_one_is_closed(own_scene):
-    before = clients()
+def test_streets_of_one_scene_share_a_client_until_the_last_one_is_closed(straight_road):
+    gc.collect()  # so that no forgotten street is collected between two counts
+    own_scene, before = replace(straight_road, name="clients"), clients()
     streets = [StreetEnv(own_scene, sensors=()) for _ in range(3)]
     other = StreetEnv(replace(own_scene, name="other_clients"), sensors=())
     assert clients() == before + 2
@@ -55,17 +48,6 @@ def test_streets_that_share_a_client_keep_their_exits_and_people_apart():
     shared = zip(*[[env.step(i)[0] for env in envs] for i in range(3)])
     for one, other in zip(alone, shared, strict=True):
         np.testing.assert_equal(list(one), list(other))
-
-
-def test_a_forgotten_street_gives_its_client_back(own_scene):
-    before = clients()
-    env = StreetEnv(own_scene)
-    env.reset(seed=0)
-    alive = weakref.ref(env)
-    del env
-    gc.collect()
-    assert alive() is None
-    assert clients() == before
 
 
 @pytest.mark.slow
