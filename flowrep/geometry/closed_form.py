@@ -133,6 +133,7 @@ def flow_planes(
     z_ratio = 1.0 + qz  # depth in the previous camera divided by depth in the current one
     in_front = has_depth & (z_ratio > MIN_DEPTH_RATIO)
     per_z = (torch.where(in_front, z_ratio, 1.0) if is_masked else z_ratio).reciprocal()
+    # Of geometry's callers alone, who know seconds; a transform's flow is per step times `scale`.
     if isinstance(dt, Tensor) or dt != 1.0:
         per_z = per_z / dt
     u = as_type((x * qz - qx) * per_z, dtype)

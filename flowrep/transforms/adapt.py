@@ -19,7 +19,7 @@ from flowrep.geometry.depth import check_depth_options
 from flowrep.geometry.flow import check_flow_options
 from flowrep.geometry.pose import POSE_SHAPES, check_pose_options
 from flowrep.transforms import base
-from flowrep.transforms.base import Keys, MapTransform, Reads, check_distinct_keys, flags_of_batch
+from flowrep.transforms.base import Keys, MapTransform, Reads, check_distinct_keys
 from flowrep.transforms.flow import CameraTransform, Intrinsics, masked_flow
 
 MapLayout: TypeAlias = Literal["hw", "hwc"]
@@ -107,9 +107,9 @@ class AdaptPose(MapTransform):
     camera's axes, which convert the world too.
 
     Args:
-        check: whether to check that poses are rigid, at resets (of the envs that are reset) and at
-            the root of batches; steps aren't checked. The check waits for a GPU: switch it off
-            where resets or replay samples have to be fast.
+        check: whether to check that poses are rigid, of envs that are reset and at the root of
+            batches, not in steps. On a GPU, which waits for the check, it is made only where all
+            envs are reset.
 
     Raises:
         ValueError: an option is unknown; in calls with `check`, a pose isn't rigid.
@@ -144,17 +144,14 @@ class AdaptPose(MapTransform):
         """Returns the pose, unchecked."""
         return (geometry.adapt_pose(pose, check=False, **self.options),)
 
-    def _check_values(self, tensordict: TensorDictBase, rows: Tensor | None = None) -> None:
-        """Raises ValueError for an ill-formed pose, in the given rows `[*B]` or in all."""
+    def _check_values(self, tensordict: TensorDictBase, *, waits: bool = False) -> None:
         if not self.check or tensordict.get(self.in_keys[0], None) is None:
             return
         (pose,) = self._inputs(tensordict)
-        if not base.has_values(pose):
+        if not (base.has_values(pose) and (waits or pose.is_cpu)):
             return
         own_dims = len(self.reads[0].shape)
-        are_bodies = pose.ndim > tensordict.ndim + own_dims
-        pose = pose if rows is None else pose[rows]
-        if are_bodies:
+        if pose.ndim > tensordict.ndim + own_dims:  # of bodies
             is_absent = pose.flatten(-own_dims).isnan().all(-1)
             if is_absent.all():
                 return
@@ -162,14 +159,6 @@ class AdaptPose(MapTransform):
             mask = is_absent.reshape(*is_absent.shape, *[1] * own_dims)
             pose = torch.where(mask, pose[~is_absent][0], pose)
         geometry.adapt_pose(pose, check=True, **self.options)
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        reset = tensordict.get("_reset", None)
-        rows = None if reset is None else flags_of_batch(reset, tensordict)
-        self._check_values(tensordict_reset, rows)
-        return super()._reset(tensordict, tensordict_reset)
 
     def output_specs(self, pose: TensorSpec) -> tuple[TensorSpec]:
         """Returns an unbounded float64 spec."""

@@ -186,7 +186,8 @@ class MapTransform(Transform):
     def _check_values(self, tensordict: TensorDictBase, *, waits: bool = False) -> None:
         """Raises ValueError for values that can't be right, if a subclass checks any.
 
-        It is called at resets and for the root of batches; only with `waits` may it wait for a GPU.
+        It is called for the envs that are reset and for the root of batches, never in a step. It
+        may wait for a GPU only with `waits`, where all envs are reset.
         """
 
     def _reset(
@@ -197,14 +198,12 @@ class MapTransform(Transform):
             self._check_steps(self._of_its_env())
         # TorchRL's `_reset` doesn't call the transform.
         begins = tensordict.get("_reset", None)
-        if begins is None:
-            self._check_values(tensordict_reset, waits=True)
+        rows = None
         # Selecting rows by a mask waits for a GPU, and each new number of rows would recompile.
-        if begins is None or begins.is_cuda or self.compiled:
-            return self._call(tensordict_reset)
-        rows = flags_of_batch(begins, tensordict_reset)
-        if rows.all() == rows.any():
-            self._check_values(tensordict_reset)
+        if begins is not None and not begins.is_cuda and not self.compiled:
+            rows = flags_of_batch(begins, tensordict_reset)
+        if rows is None or rows.all() == rows.any():
+            self._check_values(tensordict_reset, waits=begins is None)
             return self._call(tensordict_reset)
         # TorchRL keeps only the rows that are reset. Computing the others, too, would be slow for
         # estimated flow.

@@ -52,29 +52,6 @@ def test_options_are_checked(make, expected):
         make()
 
 
-def test_an_ill_formed_pose_is_refused_at_a_reset_and_on_a_batch_but_not_in_a_step():
-    td = TensorDict({"pose": torch.eye(4).repeat(2, 1, 1)}, [2])
-    td["pose"][1, 0, 0] = -1.0
-    adapt = T.AdaptPose()
-    with pytest.raises(ValueError, match=r"pose\[1\] is left-handed"):
-        adapt(td.clone())
-    with pytest.raises(ValueError, match=r"pose\[1\] is left-handed"):
-        adapt._reset(td, td.clone())
-    assert POSE in adapt._step(td, td.clone()).keys(True)
-    assert POSE in T.AdaptPose(check=False)(td.clone()).keys(True)
-
-
-@pytest.mark.parametrize("layout", ["matrix", "xyz_xyzw", "xyz_wxyz"])
-def test_rows_that_are_not_reset_are_not_checked(layout):
-    adapt = T.AdaptPose(layout=layout)
-    good = torch.eye(4) if layout == "matrix" else torch.tensor([5.0, 6, 7, 0.5, 0.5, 0.5, 0.5])
-    td = TensorDict({"pose": torch.stack([good, torch.zeros_like(good), good])}, [3])
-    resets = TensorDict({"_reset": torch.tensor([[True], [False], [True]])}, [3])
-    assert adapt._reset(resets, td.clone())[POSE].shape == (3, 4, 4)
-    with pytest.raises(ValueError, match="pose"):
-        adapt._reset(~resets, td.clone())
-
-
 def test_poses_of_several_bodies_at_once():
     poses = torch.zeros(2, 3, 7)
     poses[..., 3] = 1.0

@@ -122,6 +122,24 @@ def test_a_map_may_have_a_batch_of_its_own():
     assert T.Depth(in_keys="depth", out_keys="near")(cameras)["near"].shape == (2, 3, 1, 5, 7)
 
 
+@pytest.mark.parametrize("name", ["world_from_cam", "K"])
+def test_values_are_checked_at_resets_of_their_own_rows_and_in_batches_but_not_in_steps(name):
+    key = ("sensor", name)
+    checks = T.AdaptPose(in_keys=key, out_keys="out")
+    if name == "K":
+        checks = T.RawFlow(key, prev_intrinsics=key, out_keys="out")
+    td, first = moments(3), torch.tensor([[True], [False], [True]])
+    td[key][1] *= -1.0
+    whole, some, others = ({}, {"_reset": first}, {"_reset": ~first})
+    assert "out" in checks._reset(TensorDict(some, [3]), td.clone())
+    assert "out" in checks._step(td, td.clone())
+    for begins in (whole, others):
+        with pytest.raises(ValueError, match=f"{name}|pose"):
+            checks._reset(TensorDict(begins, [3]), td.clone())
+    with pytest.raises(ValueError, match=rf"({name}'\)|pose)\[1\]"):
+        checks(td)
+
+
 def test_wrong_number_of_keys_is_refused():
     with pytest.raises(ValueError, match=r"reads 3 keys .* in_keys has 1"):
         T.RawFlow(INTRINSICS, in_keys=["depth"])
