@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +27,7 @@ class Kitti(Recording):
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
-        names = files.find_files(self.folder / "image_2/*.png", "picture")
-        self._pairs = [name[:6] for name in names if re.fullmatch(r"\d{6}_10", name)]
+        self._pairs = [*files.find_files(self.folder / "image_2/*_10.png", "picture")]
         if not self._pairs:
             says = "has no image_2/*_10.png: give training/ of the data set"
             raise SequenceError(self.folder, says)

@@ -33,14 +33,12 @@ class StillVideo:
     notes: tuple[str, ...] = ()
 
     def __init__(self, source: str | Path | int, *, still: bool = False) -> None:
-        self.source = Path(str(source))
+        self.source = regular(Path(str(source)), math.inf)
         if not still:
             cause = "a video has no depth, without which flow of a moving camera can't be split; "
             remedy = "if it stands still say format.still=true, else bring depth too: format=frames"
             raise SequenceError(source, cause + remedy)
         self._place: int | str = int(str(source)) if str(source).isdecimal() else str(source)
-        if isinstance(self._place, str) and not self.source.is_file():
-            raise SequenceError(source, "no such file; give a video file or a camera's number")
 
     def __iter__(self) -> Iterator[Frame]:
         for number, rgb in enumerate(pictures(self._place)):
@@ -59,7 +57,8 @@ def pictures(source: int | str) -> Iterator[NDArray[np.uint8]]:
             picture = capture.read()[1]
             if picture is None:
                 if number == 0:
-                    raise SequenceError(source, "OpenCV can't read it as a video")
+                    says = "is no camera's number and no video file that OpenCV reads"
+                    raise SequenceError(source, says)
                 return
             yield np.ascontiguousarray(picture[..., ::-1])
     finally:
