@@ -13,7 +13,7 @@ pytest.importorskip("cv2", reason="recordings need OpenCV")
 import cv2
 
 from flowrep.sequences import factorize_frames, open_recording, recorded_flow
-from tests.sequences import synthetic
+from tests.sequences import synthetic, test_tools
 from tests.sequences.synthetic import HEIGHT, OPENCV_INTRINSICS, WIDTH
 
 
@@ -48,6 +48,9 @@ DECLARED = {
     "scannet": (synthetic.write_scannet, opener("scannet"), False, False, 0),
     "realsense": (synthetic.write_realsense, open_realsense, False, False, 0),
     "kubric": (synthetic.write_kubric, opener("kubric"), True, False, 1e-3),
+} | {
+    name: (partial(test_tools.write, name), opener(name, **options), False, False, 0)
+    for name, (*_, options) in test_tools.TOOLS.items()
 }
 CAMERAS = {
     "kitti": synthetic.KITTI_K, "kubric": synthetic.KUBRIC_K,
