@@ -243,12 +243,12 @@ class DeclaredRecording(Recording):
                     says = f"is [column, number]: {error}"
                     raise SequenceError("format.rows_where", says) from None
                 table = table[_column(path, table, wanted[0]) == wanted[1]]
-            if self.names is not None:
-                keys = np.array(files.read_json(self._path(self.names)), str).ravel()
-            elif by == "order":
+            if by == "order":
                 keys = None
             elif by != "name":
                 keys = _column(path, table, self.key_column)
+            elif self.names is not None:
+                keys = np.array(files.read_json(self._path(self.names)), str).ravel()
         after_key = 0 if keys is None or by == "name" else self.key_column + 1
         first, end = columns or (after_key, table.shape[1])
         if not len(table) or not first < end <= table.shape[1]:

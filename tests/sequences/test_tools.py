@@ -111,6 +111,12 @@ def test_a_picture_that_colmap_did_not_register_is_left_out(tmp_path):
     np.testing.assert_allclose(recording[0].world_from_cam[:3, 3], 2 * synthetic.pose(2)[:3, 3])
 
 
+def test_rows_of_json_may_also_be_read_in_their_order(tmp_path):
+    write("bop", tmp_path)
+    recording = open_recording(tmp_path, "bop", rows_by="order", depth_unit_m=0.001)
+    np.testing.assert_allclose(recording[2].world_from_cam, synthetic.pose(2), atol=1e-7)
+
+
 LENS = [-0.2, 0.05, 0.001, -0.002, 0.0]
 ROS = f"""
 image_width: {WIDTH}
