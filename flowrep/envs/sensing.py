@@ -60,9 +60,8 @@ class Sensing:
         config = self._scene.camera
         self._size = config.height_px, config.width_px
         self._range_m = config.near_m, config.far_m
-        pinhole = config.focal_px, config.focal_px, *self._size
         self.K = config.K
-        self._projection = camera.gl_projection(*pinhole, *self._range_m)
+        self._projection = camera.gl_projection(config.focal_px, *self._size, *self._range_m)
         self._vehicle_from_cam = camera.vehicle_from_camera(config)
         self._ids_by_number = street.ids_by_number()
         self.renderer, self._scale = renderer, scale

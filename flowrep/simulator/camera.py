@@ -30,11 +30,11 @@ def sampled_intrinsics(fx_px: float, fy_px: float, height_px: int, width_px: int
 
 
 def gl_projection(
-    fx_px: float, fy_px: float, height_px: int, width_px: int, near_m: float, far_m: float
+    focal_px: float, height_px: int, width_px: int, near_m: float, far_m: float
 ) -> list[float]:
     """Returns the 16 numbers, column by column, of the OpenGL projection of a centred camera."""
     depth_sum, depth_gap = far_m + near_m, far_m - near_m
-    scales = [2 * fx_px / width_px, 2 * fy_px / height_px, -depth_sum / depth_gap, 0.0]
+    scales = [2 * focal_px / width_px, 2 * focal_px / height_px, -depth_sum / depth_gap, 0.0]
     projection = np.diag(scales)
     projection[2, 3], projection[3, 2] = -2 * far_m * near_m / depth_gap, -1.0
     return projection.T.ravel().tolist()

@@ -137,7 +137,6 @@ class Street:
                 return "pedestrian"
         self.close_exits(closures)
         is_near = np.hypot(*(self._centres - at).T) <= self._reaches_m
-        is_near &= self.is_shown(closures)[self._owners]
         for body in dict.fromkeys(self._owners[is_near].tolist()):
             if simulator.touch(self._vehicle, self._numbers[body]):
                 return CATEGORIES[self.bodies[body].semantic]

@@ -178,15 +178,6 @@ def test_an_action_is_a_whole_number_of_any_kind(make_street, empty_road):
         assert env.episode.now.vehicle.yaw_rate_rps == pytest.approx(expected)
 
 
-def test_a_parked_car_is_hit_as_a_car(make_street, empty_road):
-    car = Obstacle("car", (40.0, 0.3), 0.0, (4.2, 1.8, 1.5))
-    scene = replace(empty_road, obstacles=(car,), categories=(*empty_road.categories, "car"))
-    rewards, info = drive(make_street(scene, sensors=()))
-    assert (info["outcome"], info["hit"]) == ("collision", "car")
-    # 40 - 2.1 - 0.5 = 37.4 m, 3.74 s.
-    assert len(rewards) == 45
-
-
 def test_the_speed_mode_changes_nothing_but_peoples_speed(make_street, straight_road):
     def travelled(speed):
         env = make_street(speed=speed, sensors=())

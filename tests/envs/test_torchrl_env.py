@@ -298,11 +298,9 @@ def test_workers_occupy_cores_and_hide_their_streets(make, in_workers, monkeypat
         street_envs(in_workers)
 
 
-@pytest.mark.slow_after_first
-@pytest.mark.parametrize("noise", [None, NOISE], ids=["exact", "noisy"])
-def test_states_pass_between_workers_and_one_process(make, noise):
+def test_states_pass_between_workers_and_one_process(make):
     actions = actions_of(30, 3, seed=3)
-    make = partial(make, representations=["ego"], num_envs=3, noise=noise)
+    make = partial(make, representations=["ego"], num_envs=3, noise=NOISE)
     alone = make(seed=0)
     _, then = play(alone, actions[:20])
     states, then = get_states(alone), then.clone()

@@ -100,15 +100,6 @@ def test_only_surfaces_between_near_and_far_plane_are_seen(z, is_seen):
     assert np.isfinite(see(facing(z, -200, 200, -200, 200))[0]).all() == is_seen
 
 
-def test_a_wall_ends_at_the_far_plane():
-    # 2 m to the right, from 1 m to 500 m ahead: column i sees it at z = 2 · 5 / (i + 0.5 - 3.5).
-    wall = quad([(2, 600, 1), (2, 600, 500), (2, -600, 500), (2, -600, 1)][::-1])
-    depth, *_ = see(wall)
-    # Columns 0 to 2 look left, column 3 straight on.
-    np.testing.assert_array_equal(depth[:, :4], np.inf)
-    np.testing.assert_allclose(depth[3, 4:], [10.0, 5.0, 10 / 3, 2.5, 2.0], rtol=1e-6)
-
-
 def test_bodies_move_with_their_poses_and_the_camera_with_its_own():
     ball, wall = facing(0.0, -0.2, 0.2, -0.2, 0.2, BALL), facing(8.0, -9, 9, -9, 9)
     # The camera stands at (1, 0, -1), so that the ball at (1.2, 0.3, 3) is seen from 4 m, at
