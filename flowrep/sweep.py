@@ -47,6 +47,7 @@ STOP = ".stop"
 """A file in a sweep's folder that makes its jobs, on any machine, save and stop."""
 TRAIN = "from flowrep.train import run_of_sweep; run_of_sweep()"
 POLL_S = 0.5
+# A process whose parent ends gets another one: so a worker notices that its launcher was killed.
 PARENT = os.getppid()
 BEGUN, FINISHED, FAILED, STOPPED = "begun", "finished", "failed", "stopped"
 _NEEDED_BY = {
@@ -194,6 +195,7 @@ def attempted(
 
 def _exit_code(request: str, log: IO[bytes], should_stop: Callable[[], bool]) -> int:
     """Runs `TRAIN` in a process and returns its exit code, minus the signal that ended it."""
+    # A run that fails has to print a line, which becomes its state, and no traceback.
     environment = {k: v for k, v in os.environ.items() if k != "HYDRA_FULL_ERROR"}
     with subprocess.Popen(
         [sys.executable, "-c", TRAIN], stdin=subprocess.PIPE, stdout=log, stderr=log,

@@ -117,7 +117,7 @@ class Film:
         else:
             tile, count = Tile(name, _colours_of(spec)), channels
         for i in range(min(count, _MOST_TILES)):
-
+            # `i` is bound here: the closure alone would see the last one of the loop.
             def part(values: Tensor, i: int = i) -> Tensor:
                 return units(values.chunk(count)[i])
 

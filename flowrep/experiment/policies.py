@@ -205,6 +205,7 @@ def packed(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
         stored[name] = weight
         if weight.is_floating_point() and weight.ndim > 1:
             scale = weight.flatten(1).abs().amax(1) / 127
+            # A row of zeros has the scale 0, and 0 / 0 would be nan.
             columns = scale.clamp(min=1e-12).view(-1, *[1] * (weight.ndim - 1))
             stored[name] = (weight / columns).round().to(torch.int8)
             stored[name + _SCALE] = scale

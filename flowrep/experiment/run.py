@@ -74,6 +74,7 @@ _IDENTITY = (
 
 def origin_of(config: Mapping[str, Any]) -> dict[str, Any]:
     """Returns the identity of a run: flowrep's version, and the config keys that define it."""
+    # Tuples become lists, as they are in a checkpoint that was read.
     parts = json.loads(json.dumps({key: config[key] for key in _IDENTITY}))
     # It only selects `algorithm.mirror` in presets; the street is the same with and without it.
     parts["scene"].pop("symmetric", None)
@@ -115,6 +116,7 @@ def machine_of(precision: torch.dtype) -> dict[str, Any]:
     home, commit = Path(__file__).parents[2], None
     if (home / ".git").exists() and shutil.which("git"):
         ask = ["git", "-C", str(home), "describe", "--always", "--dirty", "--abbrev=40"]
+        # Without tags, which would take the place of the hash.
         answer = subprocess.run([*ask, "--exclude=*"], capture_output=True, text=True)
         commit = answer.stdout.strip() or None
     return {

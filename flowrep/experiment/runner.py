@@ -155,6 +155,7 @@ class Runner:
         self.check()
         means = self.metrics.take()
         row = self.recent.summary()
+        # tqdm knows no rate before its second update.
         row |= {"updates": self.agent.updates, "frames_per_second": rate or math.nan}
         row["share_outside_updates"] = 1 - self.clock.share("update")
         row |= {name: means.get(name, math.nan) for name in self.agent.metric_names()}
@@ -232,6 +233,7 @@ class Runner:
         """Continues from the checkpoint and drops the rows logged after it."""
         path, config = self.folder.checkpoint_path, self.config
         if not path.exists():  # killed before the first one, or the file was removed
+            # A step is of `num_envs` frames: the first one that ends at `due` or later is saved.
             due = min(config.checkpoint_every_frames, config.total_frames)
             self.folder.start_again(first_save=due + config.num_envs - 1)
             return

@@ -164,6 +164,7 @@ def without_repeats(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
     """
     kept: dict[Any, Run] = {}
     warnings = []
+    # The most complete run comes first, and `setdefault` keeps it.
     for run in sorted(runs, key=lambda run: (-int(run.tested.sum()), -run.frames)):
         best = kept.setdefault((run.stack, run.seed, *sorted(run.settings.items())), run)
         if run is not best:
@@ -276,6 +277,7 @@ def scores_of(
 
     Runs that lack a condition are left out, as are runs whose score is nan.
     """
+    # A mean over fewer conditions would set easy ones against hard ones.
     ours = [r for r in sorted(runs, key=lambda r: r.seed) if r.conditions.issuperset(conditions)]
     scores = np.array([score([run.under(c)["outcome"] for c in conditions]) for run in ours])
     return scores[~np.isnan(scores)]
@@ -353,6 +355,7 @@ def cell_of(runs: Sequence[Run], condition: Condition) -> Cell | None:
     driven = [number for number in lengths if number]
     if not driven:
         return None
+    # Wilson's interval is for the run with the fewest episodes: rather too wide than too narrow.
     rates, fewest, most = scores_of(runs, [condition]), min(driven), max(driven)
     counts = f"{len(rates)} × {fewest}" + (f"–{most}" if most > fewest else "")
     return Cell(rates, counts, mean_share([rates], fewest))

@@ -265,6 +265,7 @@ def _failure_section(runs: Sequence[Run], policy: str) -> ReportSection:
     conditions = [Condition(policy, speed, fps) for speed in speeds]
     stacks = in_order([run.stack for run in runs], _TABLE_III)
     blocks = []
+    # The paper's table is of S-Turn, which therefore comes first.
     for scene in in_order(scenes_of(runs), ("s_turn",)):
         here = in_stacks([run for run in runs if run.scene == scene])
         rows = [(stack, *_failure_cells(here.get(stack, []), conditions)) for stack in stacks]
@@ -290,7 +291,9 @@ def _failure_cells(runs: Sequence[Run], conditions: Sequence[Condition]) -> tupl
     shares = scores_of(ours, conditions, departures)
     if not len(shares):
         return (*["no failures"] * 3, *counted)
+    # The rate of a run is a share of its failures, of which an average run has so many.
     share = mean_share([shares], failures // len(shares))
+    # The rest of the failures: the bounds change places.
     collisions = Estimate(1 - share.value, 1 - share.high, 1 - share.low)
     return (percent(share, 1), percent(collisions, 1), ratio(share), *counted)
 

@@ -1,20 +1,12 @@
-"""`python -m flowrep.train resume=...` many times over: imported once, forked for each command.
+"""`python -m flowrep.train resume=...` in processes that the forkserver forks: imported once.
 
-Reads one JSON object a line and answers with one. A request is
-
-    {"run": folder, "kill_after_s": 0.3, "kill_at": ["rename", 2], "largest_file": 100000}
-
-of which all but the first may be missing; the answer holds the exit code (minus the signal's number
-for a command that was killed) and what was printed.
+The tests kill these at a chosen instant.
 """
 
-import json
 import os
 import resource
 import signal
 import sys
-import tempfile
-import time
 import traceback
 from pathlib import Path
 
@@ -56,20 +48,21 @@ def killed_at(stage: str, save: int) -> None:
     setattr(module, name, counted)
 
 
-def child(request: dict, output) -> None:
-    """Runs the command and ends the process as it would."""
+def carry_on(run, printed, kill_at=None, largest_file=None):
+    """Continues a run and ends the process as the command would; `printed` gets what it prints."""
     code = 0
-    os.dup2(output.fileno(), 1)
-    os.dup2(output.fileno(), 2)
+    with open(printed, "a") as output:
+        os.dup2(output.fileno(), 1)
+        os.dup2(output.fileno(), 2)
     try:
-        if "kill_at" in request:
-            killed_at(*request["kill_at"])
-        if "largest_file" in request:
+        if kill_at:
+            killed_at(*kill_at)
+        if largest_file:
             signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-            resource.setrlimit(resource.RLIMIT_FSIZE, (request["largest_file"],) * 2)
-        folder = RunFolder.existing(request["run"])
+            resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
+        folder = RunFolder.existing(run)
         config = validated_run(folder.read_config(), "config.yaml")
-        flowrep.train.finish(config.model_copy(update={"resume": request["run"]}), folder)
+        flowrep.train.finish(config.model_copy(update={"resume": str(run)}), folder)
     except SystemExit as end:
         if isinstance(end.code, str):
             print(end.code, file=sys.stderr)
@@ -81,25 +74,3 @@ def child(request: dict, output) -> None:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
-
-
-def answer(request: dict) -> dict:
-    """Runs one command in a process of its own; kills it when its time is over."""
-    # Appended to and read by its name: what the command leaves behind (multiprocessing's resource
-    # tracker, with a last warning) may still write, and would move a shared position.
-    with tempfile.NamedTemporaryFile("a") as output:
-        pid = os.fork()
-        if not pid:
-            child(request, output)
-        if "kill_after_s" in request:
-            time.sleep(request["kill_after_s"])
-            os.kill(pid, signal.SIGKILL)
-        _, status = os.waitpid(pid, 0)
-        printed = Path(output.name).read_text(encoding="utf-8")
-        return {"code": os.waitstatus_to_exitcode(status), "printed": printed}
-
-
-if __name__ == "__main__":
-    print("ready", flush=True)
-    for line in sys.stdin:
-        print(json.dumps(answer(json.loads(line))), flush=True)

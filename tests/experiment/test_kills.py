@@ -1,10 +1,7 @@
 """A run that is killed at any instant goes on, and ends as one that never was."""
 
-import json
-import os
+import multiprocessing
 import signal
-import subprocess
-import sys
 import time
 
 import pytest
@@ -15,6 +12,7 @@ from flowrep.agent import load_checkpoint
 from flowrep.experiment.run import RunFolder
 from tests.comparing import differing
 from tests.config.composing import plain
+from tests.experiment.forked_train import carry_on as forked_train
 from tests.experiment.test_runner import without_clock
 
 pytestmark = pytest.mark.slow
@@ -38,22 +36,24 @@ def new_run(path, algorithm="dsac"):
     return run
 
 
-@pytest.fixture(scope="module")
-def carry_on():
-    """Continues a run in a process of its own; see forked_train."""
-    command = [sys.executable, "-m", "tests.experiment.forked_train"]
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
-    ) as server:
-        assert server.stdout.readline() == "ready\n"
+@pytest.fixture
+def carry_on(tmp_path, monkeypatch):
+    """Continues a run in a process of its own; returns its exit code and what it printed."""
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["tests.experiment.forked_train"])
 
-        def ask(run, **how):
-            server.stdin.write(json.dumps({"run": str(run.path)} | how) + "\n")
-            server.stdin.flush()
-            return json.loads(server.stdout.readline())
+    def carry_on(run, kill_after_s=None, **how):
+        printed = tmp_path / f"printed_{time.monotonic_ns()}"
+        process = context.Process(target=forked_train, args=(run.path, printed), kwargs=how)
+        process.start()
+        if kill_after_s is not None:
+            process.join(kill_after_s)
+            process.kill()
+        process.join()
+        return process.exitcode, printed.read_text() if printed.exists() else ""
 
-        yield ask
+    return carry_on
 
 
 @pytest.mark.parametrize("algorithm", STAGES)
@@ -62,16 +62,16 @@ def test_a_run_killed_again_and_again_ends_bit_for_bit_as_one_that_was_not(
 ):
     whole, run = new_run(tmp_path / "whole", algorithm), new_run(tmp_path / "killed", algorithm)
     start = time.monotonic()
-    assert carry_on(whole)["code"] == 0
+    assert carry_on(whole)[0] == 0
     duration = time.monotonic() - start
     carry_on(run, kill_after_s=duration / 3)
     reached = []
     for stage in STAGES[algorithm]:
-        reply = carry_on(run, kill_at=[stage, 2])  # the session's second checkpoint
-        assert reply["code"] in (0, -signal.SIGKILL), reply["printed"]
+        code, printed = carry_on(run, kill_at=[stage, 2])  # the session's second checkpoint
+        assert code in (0, -signal.SIGKILL), printed
         reached.append(load_checkpoint(run.checkpoint_path)["frames"])
     assert reached == sorted(reached)
-    assert carry_on(run)["code"] == 0
+    assert carry_on(run)[0] == 0
     expected = load_checkpoint(whole.checkpoint_path)
     assert differing(expected, load_checkpoint(run.checkpoint_path)) == []
     rows = without_clock(run.read_metrics())
@@ -82,14 +82,14 @@ def test_a_run_killed_again_and_again_ends_bit_for_bit_as_one_that_was_not(
 
 def test_a_full_disk_ends_in_one_line_and_leaves_the_last_checkpoint(tmp_path, carry_on):
     run = new_run(tmp_path)
-    assert carry_on(run, kill_at=["flush", 4])["code"] == -signal.SIGKILL
+    assert carry_on(run, kill_at=["flush", 4])[0] == -signal.SIGKILL
     before = load_checkpoint(run.checkpoint_path)
-    reply = carry_on(run, largest_file=200_000)
-    assert reply["code"] == 2
-    (line,) = [line for line in reply["printed"].splitlines() if "error" in line.lower()]
+    code, printed = carry_on(run, largest_file=200_000)
+    assert code == 2
+    (line,) = [line for line in printed.splitlines() if "error" in line.lower()]
     assert line.startswith("error: after ")
     assert "File too large" in line
-    assert f"resume={run.path}" in reply["printed"]
-    assert "Traceback" not in reply["printed"]
+    assert f"resume={run.path}" in printed
+    assert "Traceback" not in printed
     assert differing(before, load_checkpoint(run.checkpoint_path)) == []
-    assert carry_on(run)["code"] == 0
+    assert carry_on(run)[0] == 0
