@@ -5,8 +5,6 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F
-from tensordict import TensorDict
-from torchrl.data import Composite, Unbounded
 
 from flowrep.agent import DiscreteSAC, DiscreteSACWithValue
 
@@ -21,33 +19,6 @@ def test_losses_in_bfloat16_are_near_those_in_float32(make_agent, random_steps, 
         torch.testing.assert_close(
             losses["bf16"][name].detach(), losses["fp32"][name].detach(), rtol=0.02, atol=2e-3
         )
-
-
-@pytest.mark.slow
-def test_dsac_learns_to_walk_to_the_end_of_a_corridor(make_agent, as_batch):
-    """Action 2 goes right, 1 left, 0 stays; reaching the last of five cells is worth 1."""
-    spec = Composite(view=Unbounded((1, 36, 40)))
-    # in cell c, columns 8 c to 8 c + 7 are bright
-    pictures = torch.eye(5).repeat_interleave(8, 1).view(5, 1, 1, 40).repeat(1, 1, 36, 1)
-    agent = make_agent(
-        spec=spec, keys=["view"], gamma=0.5, tau=0.1, learning_rate=1e-3, initial_alpha=0.01,
-        total_frames=100_000,
-    )  # fmt: skip
-    for _ in range(100):
-        cell, action = torch.randint(4, (32,)), torch.randint(3, (32,))
-        following = (cell + torch.tensor([0, -1, 1])[action]).clamp(0)
-        end = (following == 4).unsqueeze(1)
-        later = {"view": pictures[following], "reward": end.float(), "terminated": end, "done": end}
-        steps = TensorDict({"view": pictures[cell], "action": action}, [32])
-        agent.update(as_batch(agent, steps.set("next", TensorDict(later, [32]))))
-    seen = TensorDict({"view": pictures[:4]}, [4])
-    assert agent.policy.get_dist(seen).probs.argmax(1).tolist() == [2, 2, 2, 2]
-    critic = agent.loss.qvalue_network
-    with torch.no_grad(), agent.loss.qvalue_network_params[0].to_module(critic):
-        images = agent.codecs[0].decode(seen["view"])
-        q = critic.module(agent.loss.critic_encoder([images]))
-    # going right is worth gamma to the power of the cells left to go: 0.125, 0.25, 0.5, 1
-    torch.testing.assert_close(q[:, 2], torch.tensor([0.125, 0.25, 0.5, 1.0]), atol=0.1, rtol=0)
 
 
 LR, ALPHA, GAMMA, TAU, TARGET_ENTROPY = 3e-4, 0.5, 0.99, 0.005, 0.2 * math.log(3)

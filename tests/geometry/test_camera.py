@@ -23,14 +23,6 @@ def test_project_skew_by_hand(skew, u):
     assert project(torch.tensor([1.0, 2.0, 4.0]), camera(skew=skew)).tolist() == [u, 49.0]
 
 
-@pytest.mark.parametrize(("skew", "x"), [(0.0, 0.25), (3.0, -0.5)])
-def test_unproject_skew_by_hand(skew, x):
-    # Column 1, row 0 at 2 m: u = 1.5, v = 0.5, so y/z = (0.5 - 0.25) / 0.5 = 0.5 and
-    # x/z = (1.5 - 1 - skew * 0.5) / 4.
-    K = camera(fx=4.0, skew=skew, cx=1.0, fy=0.5, cy=0.25)
-    assert unproject(torch.full((1, 1, 2), 2.0), K)[0, 1].tolist() == [x, 1.0, 2.0]
-
-
 def test_pixel_to_camera_to_pixel_comes_back():
     pixels = project(unproject(depth_map(), K), K)
     v, u = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")

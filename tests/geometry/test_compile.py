@@ -64,15 +64,6 @@ def test_flow_is_one_graph(dt, prev_K):
 
 
 @pytest.mark.slow
-def test_sizes_may_change_between_calls():
-    compiled = torch.compile(ego_flow, fullgraph=True, backend="eager", dynamic=True)
-    for height, width in [(5, 7), (4, 9)]:
-        depth = torch.full((1, height, width), 3.0)
-        expected = ego_flow(depth, K.float(), MOTION.float())
-        assert_same(compiled(depth, K.float(), MOTION.float()), expected)
-
-
-@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("prev_K", [None, 1.1 * K.float()])
 def test_compiled_code_gives_the_bits_of_eager_from_transposed_memory_too(prev_K):

@@ -228,16 +228,13 @@ def test_before_a_model(case, inputs):
 
 
 @each_case
-@pytest.mark.parametrize("method", ["transform=", "append_transform"])
-def test_on_shuffled_samples_of_a_replay_buffer(case, inputs, method):
+def test_on_shuffled_samples_of_a_replay_buffer(case, inputs):
     if case.carries:
         inputs = case.make()(inputs)
         under_next = [key if isinstance(key, tuple) else (key,) for key in case.oracles]
         inputs = inputs.exclude(*(("next", *key) for key in under_next))
-    options = {"transform": case.make()} if method == "transform=" else {}
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(64), batch_size=40, **options)
-    if method == "append_transform":
-        buffer.append_transform(case.make())
+    storage = LazyTensorStorage(64)
+    buffer = TensorDictReplayBuffer(storage=storage, batch_size=40, transform=case.make())
     buffer.extend(inputs.reshape(-1))
     torch.manual_seed(0)
     assert_right(buffer.sample(), case.oracles)

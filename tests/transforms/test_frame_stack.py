@@ -20,14 +20,13 @@ from torchrl.data import (
     TensorDictReplayBuffer,
     Unbounded,
 )
-from torchrl.envs import ParallelEnv, TransformedEnv
+from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import (
     Compose,
     DTypeCastTransform,
     MultiStepTransform,
     ObservationNorm,
 )
-from torchrl.envs.utils import step_mdp
 
 from flowrep.transforms import Depth, FrameStack, Segmentation
 from tests.transforms import oracles
@@ -44,26 +43,6 @@ def stack_of_three() -> FrameStack:
 
 def stacked_single(env: int) -> TransformedEnv:
     return TransformedEnv(FakeSensorEnv((), env), stack_of_three())
-
-
-def frames_of(stacks: torch.Tensor) -> list[list[tuple[int, int]]]:
-    """Returns the (episode, step) of each frame of each stack `[T, 3, H, W]`."""
-    return [[moment(frame.unsqueeze(0))[1:] for frame in stack] for stack in stacks]
-
-
-@pytest.mark.slow
-def test_a_worker_is_given_the_stack_that_its_step_continues():
-    makers = [functools.partial(stacked_single, i) for i in (0, 1)]
-    env = ParallelEnv(2, makers, mp_start_method="fork")
-    try:
-        first = env.reset().set("action", torch.zeros(2, dtype=torch.long))
-        td = first.clone()
-        for _ in range(2):
-            td = step_mdp(env.step(td), keep_other=False).set("action", first["action"])
-        again = env.step(first)  # from the first stack, though the env itself has gone on
-    finally:
-        env.close()
-    assert frames_of(again["next", STACK]) == [[(0, 0), (0, 0), (0, 3)]] * 2
 
 
 def test_a_collector_goes_on_where_its_last_batch_ended():

@@ -21,7 +21,6 @@ from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import Compose, EnvBase, TransformedEnv, check_env_specs
 
 from flowrep import diagnose
-from flowrep.geometry import intrinsics_from_fov
 from flowrep.transforms import CONVENTIONS, FlowFactorize, RawFlow, sensors_from
 from tests.running import ENVIRONMENT, run_python
 
@@ -481,48 +480,6 @@ def test_the_page_has_every_row_and_its_python_runs():
 
 
 # On the simulator itself; MuJoCo's, mjlab's and ManiSkill's rows are tested by tests/examples
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("depth", CONVENTIONS["newton"].depth)
-def test_newton_itself(depth):
-    newton = pytest.importorskip("newton", reason="pip install newton; it runs on a CPU")
-    import warp as wp
-
-    size, fov = (60, 90), math.radians(60)
-    builder = newton.ModelBuilder()
-    builder.add_ground_plane()
-    bodies = [builder.add_body() for _ in range(2)]
-    shapes = [
-        builder.add_shape_box(bodies[0], hx=0.3, hy=0.2, hz=0.2),
-        builder.add_shape_sphere(bodies[1], radius=0.3),
-    ]
-    model = builder.finalize(device="cpu")
-    state, sensor = model.state(), newton.sensors.SensorCamera(model)
-    rays = sensor.compute_camera_rays_pinhole(*size[::-1], camera_fov=fov, device=model.device)
-    frames = []
-    for t in range(5):
-        poses = state.body_q.numpy()
-        turned = Rotation.from_euler("xyz", [10 * t, 5 * t, 12 * t], degrees=True)
-        poses[0] = [-0.4 + 0.08 * t, 0.1 * t, 0.5, *turned.as_quat()]
-        poses[1] = [0.5, -0.05 * t, 0.5 + 0.03 * t, 0, 0, 0, 1]
-        state.body_q.assign(poses)
-        model.bvh_refit_shapes(state)
-        ahead = Rotation.from_euler("xyz", [70 + t, 0, 60 + 2 * t], degrees=True)
-        camera = np.float32([2.2 - 0.05 * t, -1.2 + 0.08 * t, 1.2, *ahead.as_quat()])
-        images = {
-            "depth_image": sensor.allocate_image_depth(1, *size[::-1]),
-            "forward_depth_image": sensor.allocate_image_depth_forward(1, *size[::-1]),
-            "shape_index_image": sensor.allocate_image_shape_index(1, *size[::-1]),
-        }
-        at = wp.array([wp.transform(*camera)], dtype=wp.transformf, device=model.device)
-        sensor.update(state, at, rays, **images)
-        seen = {name.removesuffix("_image"): x.numpy()[0].copy() for name, x in images.items()}
-        of_shapes = state.body_q.numpy()[model.shape_body.numpy()[shapes]]
-        frames.append(seen | {"camera_transforms": camera, "body_q": of_shapes})
-    K = intrinsics_from_fov(math.degrees(fov), axis="vertical", height=size[0], width=size[1])
-    more = {"intrinsics": K} if depth == "depth" else {}
-    assert_warps("newton", frames, K, depth=depth, body_ids=shapes, static_ids=[0], **more)
 
 
 def assert_warps(simulator, frames, K, differing=0.0, **options):
