@@ -144,11 +144,6 @@ def read_rows(
     return rows
 
 
-def is_whole(path: Path) -> bool:
-    """Returns whether a table ends with a complete line, or does not exist."""
-    return not path.is_file() or path.read_bytes().endswith(b"\n")
-
-
 def write_rows(
     path: Path, rows: Iterable[Mapping[str, Any]], columns: Iterable[str] | None = None
 ) -> None:

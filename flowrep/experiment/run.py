@@ -41,7 +41,6 @@ from flowrep.extras import require
 from flowrep.files import (
     TableError,
     append_rows,
-    is_whole,
     naming,
     read_rows,
     refuse_link,
@@ -353,9 +352,8 @@ class RunFolder:
         """Drops the rows logged after `frames`; a resumed run writes them again."""
         metrics, episodes = self.read_metrics(), self.read_episodes()
         for path, rows in ((self.metrics_path, metrics), (self.evaluation_path, episodes)):
-            kept = [row for row in rows if int(row["frames"]) <= frames]
-            if len(kept) < len(rows) or not is_whole(path):
-                write_rows(path, kept)
+            # Written again in any case, as half a last line would become a part of the next row.
+            write_rows(path, [row for row in rows if int(row["frames"]) <= frames])
 
     def start_again(self, first_save: int) -> None:
         """Drops all rows of a run that was killed before its first checkpoint, to start it again.

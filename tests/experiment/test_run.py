@@ -160,6 +160,8 @@ def test_a_resumed_run_drops_the_rows_it_will_write_again(tmp_path):
         run.log_metrics(frames, {"alpha": 1 / frames})
         run.log_episodes([episode(frames, frames=frames)])
     run.forget_after(20)
+    run.metrics_path.write_bytes(run.metrics_path.read_bytes() + b"23,0.")  # killed as it wrote
+    run.forget_after(20)
     run.log_metrics(25, {"alpha": 0.5})
     assert [row["frames"] for row in run.read_metrics()] == ["10", "20", "25"]
     assert [row["frames"] for row in run.read_episodes()] == ["10", "20"]
