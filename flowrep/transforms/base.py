@@ -194,7 +194,7 @@ class MapTransform(Transform):
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         # Loops that read no specs don't call `transform_input_spec`.
-        if self.container is not None and not torch.compiler.is_compiling():
+        if not torch.compiler.is_compiling() and _is_in_env(self):
             self._check_steps(self._of_its_env())
         # TorchRL's `_reset` doesn't call the transform.
         begins = tensordict.get("_reset", None)
@@ -278,6 +278,14 @@ class MapTransform(Transform):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.in_keys} -> {self.out_keys})"
+
+
+def _is_in_env(transform: Any) -> bool:
+    # `container` raises in a Compose that is in no env, as gymnasium's wrapper has one.
+    while isinstance(transform, Transform):
+        held = transform.__dict__["_container"]
+        transform = held and held()
+    return transform is not None
 
 
 class RecurrentTransform(MapTransform):
