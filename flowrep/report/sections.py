@@ -141,7 +141,7 @@ def _group_sections(group: Group, policy: str) -> list[ReportSection]:
         every = list(combinations(reversed(by_stack), 2))
         sections.append(_success_section("success", "Success", by_stack, every, policy))
     sections.append(_failure_section(runs, policy))
-    if len(_frame_rates(runs, policy)) > 1:
+    if any(len(_frame_rates([run], policy)) > 1 for run in runs):
         sections.append(_rate_section(runs, policy))
     return [*sections, *_curves(group.runs)]
 

@@ -124,6 +124,13 @@ def test_the_change_with_the_frame_rate_is_that_of_the_same_agents_and_episodes(
     assert lost == "−75"
 
 
+def test_runs_that_each_drove_at_one_frame_rate_show_no_change_with_it(tmp_path):
+    for seed, fps in enumerate((12.0, 6.0)):
+        config = config_of(seed=seed)
+        write_run(tmp_path / f"{seed}", config, rows_of(config, "sscc", fps=fps))
+    assert "frame_rate" not in sections_of(tmp_path)[0]
+
+
 def test_a_run_that_drove_other_episodes_in_each_condition_is_no_part_of_a_change(tmp_path):
     # Seed 0 loses both of its episodes; seed 1 drove others at low speed. As a change of 0 it
     # would halve the loss.
