@@ -497,7 +497,8 @@ def assert_warps(simulator, frames, K, differing=0.0, **options):
     assert sky.any()
     assert (is_inf != sky).float().mean() <= differing
     found = diagnose(td, K)
-    assert found.is_right, found
+    # The floor alone stands still, and its depth doesn't show that a camera slides along it.
+    assert not found.is_wrong, found
 
 
 def test_pybullet_itself():
