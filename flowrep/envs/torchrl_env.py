@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from gymnasium.vector import VectorEnv
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import Compose, GymWrapper, TransformedEnv
@@ -45,23 +44,10 @@ def sensors_read(transforms: Iterable[Any]) -> list[str]:
 
 
 class VectorWrapper(GymWrapper):
-    """TorchRL's wrapper; reset masks are optional, and moved to the CPU.
+    """TorchRL's wrapper of streets; reset masks are optional, and moved to the CPU."""
 
-    Args:
-        env: the vector env of the streets.
-        scene: the scene of all its envs, kept as an attribute, as is `frame_rate_hz`.
-        kwargs: see `torchrl.envs.GymWrapper`.
-    """
-
-    def __init__(
-        self,
-        env: VectorEnv,
-        scene: Scene,
-        frame_rate_hz: float,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(env, **kwargs)
-        self.scene, self.frame_rate_hz = scene, frame_rate_hz
+    scene: Scene
+    frame_rate_hz: float
 
     def _replace_reset(self, reset: Tensor | None, kwargs: dict[str, Any]) -> dict[str, Any]:
         # TorchRL 0.14 passes masks on from the TensorDict's device, which fails on CUDA, and
@@ -142,7 +128,6 @@ def make_env(
         picture_scale = flow["picture_scale"]
     drawn: Any = {"renderer": renderer, "picture_scale": picture_scale}
     street = partial(StreetEnv, loaded, speed, frame_rate_hz, **drawn)
-    frame_rate_hz = checked_frame_rate(loaded, frame_rate_hz)
     transforms = Compose()
     if representations:
         transforms = representation_stack(
@@ -164,11 +149,10 @@ def make_env(
         WorkerVectorEnv(factories, num_workers, in_each=StreetVectorEnv)
         if num_workers
         else StreetVectorEnv(factories),
-        loaded,
-        frame_rate_hz,
         device=device,
         categorical_action_encoding=True,
     )
+    base.scene, base.frame_rate_hz = loaded, checked_frame_rate(loaded, frame_rate_hz)
     env = TransformedEnv(base, transforms)
     if seed is not None:
         env.set_seed(seed)
