@@ -65,7 +65,31 @@ def adapt_depth(
     >>> adapt_depth(torch.tensor([[[8.0, 0.0]]]), "disparity", K=40 * torch.eye(3), baseline_m=0.1)
     tensor([[[0.5000,    inf]]])
     """
-    check_depth_options(kind, K is not None, near_m, far_m, scale_m, sky, baseline_m)
+    check_name("kind", kind, DepthKind)
+    if (K is not None) != (kind in ("ray_length", "disparity")):
+        raise ValueError(
+            "'ray_length' and 'disparity' need K (AdaptDepth: intrinsics=), the other kinds do not "
+            f"read it; kind is {kind!r}"
+        )
+    if (baseline_m is not None) != (kind == "disparity") or not (baseline_m or 1.0) > 0:
+        raise ValueError(
+            "'disparity' needs baseline_m, a positive number of metres, the other kinds do not "
+            f"read it; kind is {kind!r}, baseline_m={baseline_m}"
+        )
+    is_buffer = kind.endswith("z_buffer")
+    planes = (near_m is not None) + (far_m is not None)
+    if planes != (2 if is_buffer else 0):
+        raise ValueError(
+            "'z_buffer' and 'reversed_z_buffer' need near_m and far_m, the other kinds do not "
+            f"read them; kind is {kind!r}, near_m={near_m}, far_m={far_m}"
+        )
+    if scale_m is not None and (is_buffer or not 0 < scale_m < math.inf):
+        raise ValueError(
+            f"scale_m is metres per unit, positive, and a z-buffer has none; kind is {kind!r}, "
+            f"scale_m={scale_m}"
+        )
+    if sky is not None and is_buffer:
+        raise ValueError(f"a z-buffer's sky is its far plane, not sky={sky}; kind is {kind!r}")
     is_sky = None if sky is None else _is_sky(depth, sky)
     unmeasured = None if nothing is None else depth == nothing
     if scale_m is not None:
@@ -148,40 +172,3 @@ def z_from_z_buffer(
     z = torch.where(is_sky, torch.inf, near_m / (to_near + to_far * (near_m / far_m)))
     is_known = is_sky | ((to_near >= 0.0) & (to_far >= -tolerance))
     return torch.where(is_known, z, torch.nan)
-
-
-def check_depth_options(
-    kind: str,
-    has_camera: bool,
-    near_m: float | None,
-    far_m: float | None,
-    scale_m: float | None = None,
-    sky: float | None = None,
-    baseline_m: float | None = None,
-) -> None:
-    """Raises ValueError if an argument that `kind` needs is missing, or an unused one is given."""
-    check_name("kind", kind, DepthKind)
-    if has_camera != (kind in ("ray_length", "disparity")):
-        raise ValueError(
-            "'ray_length' and 'disparity' need K (AdaptDepth: intrinsics=), the other kinds do not "
-            f"read it; kind is {kind!r}"
-        )
-    if (baseline_m is not None) != (kind == "disparity") or not (baseline_m or 1.0) > 0:
-        raise ValueError(
-            "'disparity' needs baseline_m, a positive number of metres, the other kinds do not "
-            f"read it; kind is {kind!r}, baseline_m={baseline_m}"
-        )
-    is_buffer = kind.endswith("z_buffer")
-    planes = (near_m is not None) + (far_m is not None)
-    if planes != (2 if is_buffer else 0):
-        raise ValueError(
-            "'z_buffer' and 'reversed_z_buffer' need near_m and far_m, the other kinds do not "
-            f"read them; kind is {kind!r}, near_m={near_m}, far_m={far_m}"
-        )
-    if scale_m is not None and (is_buffer or not 0 < scale_m < math.inf):
-        raise ValueError(
-            f"scale_m is metres per unit, positive, and a z-buffer has none; kind is {kind!r}, "
-            f"scale_m={scale_m}"
-        )
-    if sky is not None and is_buffer:
-        raise ValueError(f"a z-buffer's sky is its far plane, not sky={sky}; kind is {kind!r}")

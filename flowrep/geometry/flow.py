@@ -228,15 +228,6 @@ def adapt_flow(
     >>> adapt_flow(flow, direction="backward", grid="current", channels="row_column").flatten()
     tensor([ 2., -3.])
     """
-    check_flow_options(direction, grid, channels)
-    check_shape("flow", flow, (2, "H", "W"))
-    if channels == "row_column":
-        flow = flow.flip(-3)
-    return -flow if direction == "backward" else flow
-
-
-def check_flow_options(direction: str, grid: str, channels: str) -> None:
-    """Raises ValueError for an unknown name, and for the previous frame's grid."""
     check_name("direction", direction, Direction)
     check_name("grid", grid, Grid)
     check_name("channels", channels, Channels)
@@ -248,6 +239,10 @@ def check_flow_options(direction: str, grid: str, channels: str) -> None:
             "frame to the previous one (with most estimators: swap the two pictures) and adapt it "
             "with direction='backward', grid='current'"
         )
+    check_shape("flow", flow, (2, "H", "W"))
+    if channels == "row_column":
+        flow = flow.flip(-3)
+    return -flow if direction == "backward" else flow
 
 
 def _check(

@@ -302,7 +302,14 @@ def adapt_pose(
     >>> world_from_cam @ torch.tensor([0.0, 0.0, 1.0, 1.0]).double()  # a metre ahead: along x
     tensor([6., 6., 7., 1.], dtype=torch.float64)
     """
-    check_pose_options(layout, direction, axes)
+    check_name("layout", layout, PoseLayout)
+    check_name("direction", direction, PoseDirection)
+    check_name("axes", axes, CameraAxes)
+    if layout.startswith("xyz_yaw") and axes not in ("x_forward_z_up", "unreal"):
+        raise ValueError(
+            f"layout {layout!r} is for a camera that looks along its x axis, with z up: "
+            f'axes="x_forward_z_up" or "unreal", not {axes!r}'
+        )
     check_shape("pose", pose, POSE_SHAPES[layout])
     if layout == "matrix":
         matrix = pose.double()
@@ -331,18 +338,6 @@ def adapt_pose(
         return matrix
     rows = matrix.split(1, -2)
     return torch.cat([-row if axis == opposite else row for axis, row in enumerate(rows)], -2)
-
-
-def check_pose_options(layout: str, direction: str, axes: str) -> None:
-    """Raises ValueError for an unknown name, and for angles of a camera that looks along its z."""
-    check_name("layout", layout, PoseLayout)
-    check_name("direction", direction, PoseDirection)
-    check_name("axes", axes, CameraAxes)
-    if layout.startswith("xyz_yaw") and axes not in ("x_forward_z_up", "unreal"):
-        raise ValueError(
-            f"layout {layout!r} is for a camera that looks along its x axis, with z up: "
-            f'axes="x_forward_z_up" or "unreal", not {axes!r}'
-        )
 
 
 def _pose_from_angles(pose: Tensor) -> Tensor:

@@ -15,9 +15,7 @@ from torchrl.data import TensorSpec, Unbounded
 
 from flowrep import geometry
 from flowrep.geometry.checks import checked_count
-from flowrep.geometry.depth import check_depth_options
-from flowrep.geometry.flow import check_flow_options
-from flowrep.geometry.pose import POSE_SHAPES, check_pose_options
+from flowrep.geometry.pose import POSE_SHAPES
 from flowrep.transforms import base
 from flowrep.transforms.base import Keys, MapTransform, Reads, check_distinct_keys
 from flowrep.transforms.flow import CameraTransform, Intrinsics, masked_flow
@@ -69,15 +67,16 @@ class AdaptDepth(CameraTransform):
         in_keys: Keys = "depth",
         out_keys: Keys = ("sensor", "depth"),
     ) -> None:
-        has_camera = intrinsics is not None
-        check_depth_options(kind, has_camera, near_m, far_m, scale_m, sky, baseline_m)
+        options: dict[str, Any] = {"kind": kind, "near_m": near_m, "far_m": far_m}
+        options |= {"scale_m": scale_m, "nothing": nothing, "sky": sky, "baseline_m": baseline_m}
+        # Without pixels, the conversion checks its options alone, as in the adapters below.
+        K = None if intrinsics is None else torch.eye(3)
+        geometry.adapt_depth(torch.empty(1, 0, 0), K=K, **options)
         shape = ("H", "W", 1) if channels_last else base.DEPTH.shape
         reads = Reads(shape, "float" if scale_m is None else "any")
         super().__init__(intrinsics, [reads], in_keys, out_keys)
         check_distinct_keys(self)
-        self.options: dict[str, Any] = {"kind": kind, "near_m": near_m, "far_m": far_m}
-        self.options |= {"scale_m": scale_m, "nothing": nothing, "sky": sky}
-        self.options["baseline_m"] = baseline_m
+        self.options = options
         self.channels_last = channels_last
 
     def compute(self, depth: Tensor, K: Tensor | None = None) -> tuple[Tensor]:
@@ -134,10 +133,11 @@ class AdaptPose(MapTransform):
         in_keys: Keys = "pose",
         out_keys: Keys = ("sensor", "world_from_cam"),
     ) -> None:
-        check_pose_options(layout, direction, axes)
+        options: dict[str, Any] = {"layout": layout, "direction": direction, "axes": axes}
+        geometry.adapt_pose(torch.empty(0, *POSE_SHAPES.get(layout, ())), **options)
         super().__init__([Reads(POSE_SHAPES[layout], "float")], in_keys, out_keys)
         check_distinct_keys(self)
-        self.options: dict[str, Any] = {"layout": layout, "direction": direction, "axes": axes}
+        self.options = options
         self.check = bool(check)
 
     def compute(self, pose: Tensor) -> tuple[Tensor]:
@@ -203,11 +203,12 @@ class AdaptFlow(MapTransform):
         in_keys: Keys = "flow",
         out_keys: Keys = "raw",
     ) -> None:
-        check_flow_options(direction, grid, channels)
+        options: dict[str, Any] = {"direction": direction, "grid": grid, "channels": channels}
+        geometry.adapt_flow(torch.empty(2, 0, 0), **options)
         reads = Reads(("H", "W", 2), "float", spans_step=True) if channels_last else base.FLOW
         super().__init__([reads], in_keys, out_keys)
         check_distinct_keys(self)
-        self.options: dict[str, Any] = {"direction": direction, "grid": grid, "channels": channels}
+        self.options = options
         self.channels_last = channels_last
 
     def _read(self, tensordict: TensorDictBase) -> list[Tensor]:

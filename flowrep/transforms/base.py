@@ -45,8 +45,6 @@ class Reads(NamedTuple):
         return f"{'' if self.kind == 'any' else self.kind + ' '}[*B, {sizes}]"
 
 
-CALLS_PER_LOOK = 100  # on a GPU, one call of this many checks values: each check waits for them
-
 _UNSIGNED = (torch.uint16, torch.uint32, torch.uint64)
 
 DEPTH = Reads((1, "H", "W"), "float")

@@ -14,7 +14,6 @@ from torchrl.data import Bounded, Categorical, TensorSpec
 from flowrep import geometry
 from flowrep.geometry.checks import check_name, checked_count, checked_number
 from flowrep.transforms.base import (
-    CALLS_PER_LOOK,
     DEPTH,
     IDS,
     RGB,
@@ -27,6 +26,7 @@ from flowrep.transforms.base import (
 
 Encoding = Literal["ids", "onehot"]
 
+_CALLS_PER_LOOK = 100  # on a GPU, one call of this many checks ids: each check waits for them
 _LINK_BIT = 24  # PyBullet's ids: body + (link + 1 << 24)
 
 
@@ -253,7 +253,7 @@ class InstanceIds(MapTransform):
             return next_tensordict
         self._calls_to_skip -= 1
         if self._calls_to_skip < 0:
-            self._calls_to_skip = CALLS_PER_LOOK - 1 if ids.is_cuda else 0
+            self._calls_to_skip = _CALLS_PER_LOOK - 1 if ids.is_cuda else 0
             ids = ids.to(signed(ids.dtype))
             self._name_ids_without_row(ids, next_tensordict[self.out_keys[0]])
         return next_tensordict
@@ -283,7 +283,7 @@ class InstanceIds(MapTransform):
             stacklevel=2,
         )
         self._static |= set(numbers)
-        self._calls_to_skip = CALLS_PER_LOOK - 1  # the search is another pass over the ids
+        self._calls_to_skip = _CALLS_PER_LOOK - 1  # the search is another pass over the ids
 
     def output_specs(self, ids: TensorSpec) -> tuple[TensorSpec]:
         """Returns a categorical spec of 1 + N rows."""

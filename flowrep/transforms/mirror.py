@@ -14,7 +14,7 @@ from torchrl.envs.transforms import Transform
 from flowrep.geometry.checks import check_name
 from flowrep.transforms.base import Keys, MissingKey, as_keys
 
-Images = Literal["half", "both", "all"]
+Images = Literal["half", "all"]
 _INTEGERS = {1: torch.uint8, 2: torch.int16, 4: torch.int32, 8: torch.int64}  # by bytes
 
 
@@ -49,8 +49,7 @@ class Mirror(Transform):
         intrinsics: K `[3, 3]` of the maps, without skew; None if it is centred, cx = W / 2. 2·cx
             has to be whole, since class ids can't be interpolated.
         images: "half" replaces each transition with probability 1/2, a trajectory (with a dimension
-            named "time") as a whole; "both" appends the images along the first dimension, which
-            doubles it; "all" replaces all.
+            named "time") as a whole; "all" replaces all.
 
     Raises:
         ValueError: `in_keys` repeats a key, `flow_keys` holds a key that `in_keys` lacks,
@@ -101,7 +100,7 @@ class Mirror(Transform):
         self.images = images
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Returns the batch with images instead of transitions, or appended to them."""
+        """Returns the batch with images instead of transitions."""
         if lacking := [key for key in self.in_keys if tensordict.get(key, None) is None]:
             known = sorted(tensordict.keys(True, True), key=str)
             raise MissingKey(f"Mirror needs key {lacking[0]!r}; the batch has {known}")
@@ -110,10 +109,7 @@ class Mirror(Transform):
             drawn = [1 if name == "time" else n for name, n in zip(tensordict.names, shape)]
             chosen = (torch.rand(drawn, device=device) < 0.5).expand(shape)
             return self._mirror(tensordict, chosen)
-        chosen = torch.ones(shape, dtype=torch.bool, device=device)
-        if self.images == "all":
-            return self._mirror(tensordict, chosen)
-        return torch.cat([tensordict, self._mirror(tensordict.copy(), chosen)])
+        return self._mirror(tensordict, torch.ones(shape, dtype=torch.bool, device=device))
 
     def _mirror(self, tensordict: TensorDictBase, chosen: Tensor) -> TensorDictBase:
         """Replaces the `chosen` `[*B]` transitions by their images."""

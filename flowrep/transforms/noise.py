@@ -121,7 +121,13 @@ class SensorNoise(MapTransform):
             "flow_sigma_px": flow_sigma_px,
         }
         check_choice("sensors", sensors, NOISY_SENSORS)
-        _check_options(sensors, options)
+        for name, value in options.items():
+            checked_number(name, value, "a finite number of at least 0", lambda x: x >= 0)
+            (sensor,) = (each for each, x in NOISY_SENSORS.items() if name in x.options)
+            if value and sensor not in sensors:
+                raise ValueError(f"{name} needs {sensor!r} among sensors, got {list(sensors)}")
+        if depth_dropout > 1.0:
+            raise ValueError(f"depth_dropout must be a probability, got {depth_dropout}")
         read = (
             [NOISY_SENSORS[name].key for name in sensors] if in_keys is None else as_keys(in_keys)
         )
@@ -234,16 +240,6 @@ def drifted_motion(
     moved = motion[..., :3, 3:] + motion[..., :3, :3] @ (drift_m * shift).unsqueeze(-1)
     rigid = torch.cat([torch.cat([turned, moved], -1), motion[..., 3:, :]], -2)
     return rigid.to(prev_from_curr.dtype)
-
-
-def _check_options(sensors: Sequence[str], options: dict[str, float]) -> None:
-    for name, value in options.items():
-        checked_number(name, value, "a finite number of at least 0", lambda x: x >= 0)
-        (sensor,) = (sensor for sensor in NOISY_SENSORS if name in NOISY_SENSORS[sensor].options)
-        if value and sensor not in sensors:
-            raise ValueError(f"{name} needs {sensor!r} among sensors, got {list(sensors)}")
-    if options["depth_dropout"] > 1.0:
-        raise ValueError(f"depth_dropout must be a probability, got {options['depth_dropout']}")
 
 
 def split_mix(state: Tensor) -> Tensor:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from tensordict import TensorDictBase
@@ -136,28 +135,37 @@ def representation_stack(
     noisy = _noise(noise, chosen, reads_motion=motion == "exact")
     keys = {name: NOISY_SENSORS[name].key for name in _NOISY_KEYS}
     keys |= {name: key for name, key in _NOISY_KEYS.items() if noisy and key in noisy[0].out_keys}
-    camera = _Camera(
-        intrinsics={"intrinsics": intrinsics, "prev_intrinsics": prev_intrinsics},
-        depth=keys["depth"],
-        motion=_ESTIMATED_MOTION_KEY if estimates_motion else keys["motion"],
-        compiled=compiled,
-    )
     transforms = [*noisy, *_maps(chosen, num_classes, keys["depth"])]
-    if flows:
-        needs_unscaled = "obj" in flows or estimates_motion
-        if estimator is None:
-            sources = _exact_flow(flows, camera, needs_unscaled, estimates_motion)
-        elif needs_unscaled or "raw" in flows:
-            sources = _estimated_flow(flows, estimator, camera, estimates_motion)
-        else:
-            sources = []
-        for transform in sources:
-            if transform.out_keys[0] not in flows:  # errors name the representations that need it
-                transform.label = " and ".join(map(repr, flows))
-        is_written = any("raw" in transform.out_keys for transform in sources)
-        factors = {name: flows[name] for name in flows if not (name == "raw" and is_written)}
-        unscaled = _UNSCALED_KEY if estimator is None else _ESTIMATED_FLOW_KEY
-        transforms += [*sources, *_split(factors, unscaled, camera)]
+    camera: Arguments = {"intrinsics": intrinsics, "prev_intrinsics": prev_intrinsics}
+    motion_key = _ESTIMATED_MOTION_KEY if estimates_motion else keys["motion"]
+    # obj needs flow in px/step, as does an estimate of the motion.
+    needs_unscaled = "obj" in flows or estimates_motion
+    unscaled = _UNSCALED_KEY if estimator is None else _ESTIMATED_FLOW_KEY
+    sources: list[Transform] = []
+    if estimator is not None and (needs_unscaled or "raw" in flows):
+        inputs = [_PICTURES_KEY, keys["depth"], motion_key]
+        sources = _estimated_flow(flows, estimator, camera, inputs, estimates_motion)
+    elif estimator is None and needs_unscaled:
+        sources = [RawFlow(**camera, compiled=compiled, out_keys=unscaled)]
+        if estimates_motion:
+            sources.append(_motion([unscaled, keys["depth"]], camera))
+    elif estimator is None and "raw" in flows:
+        sources = [RawFlow(**camera, compiled=compiled, **flows["raw"])]
+    for transform in sources:
+        if transform.out_keys[0] not in flows:  # errors name the representations that need it
+            transform.label = " and ".join(map(repr, flows))
+    transforms += sources
+    is_written = any("raw" in transform.out_keys for transform in sources)
+    factors = {name: flows[name] for name in flows if not (name == "raw" and is_written)}
+    if factors:
+        factorize = FlowFactorize(
+            **camera,
+            compiled=compiled,
+            outputs=list(factors),
+            scale={name: options["scale"] for name, options in factors.items()},
+            in_keys=[*([] if set(factors) == {"ego"} else [unscaled]), keys["depth"], motion_key],
+        )
+        transforms.append(factorize)
     transforms += foreign.values()
     written = dict.fromkeys(key for transform in transforms for key in transform.out_keys)
     shown = {*named, *_KEPT, *(key for each in foreign.values() for key in each.out_keys)}
@@ -304,91 +312,42 @@ def _maps(
     return maps + stacks
 
 
-@dataclass(frozen=True)
-class _Camera:
-    """What the flow transforms have in common: K, and the keys of depth and motion."""
-
-    intrinsics: Arguments
-    depth: NestedKey
-    motion: NestedKey
-    compiled: bool
-
-    @property
-    def options(self) -> Arguments:
-        return {**self.intrinsics, "compiled": self.compiled}
-
-
-def _exact_flow(
-    flows: Mapping[str, Arguments], camera: _Camera, needs_unscaled: bool, estimates_motion: bool
-) -> list[Transform]:
-    """Returns `RawFlow` and, with `estimates_motion`, the transform that estimates the motion.
-
-    With `needs_unscaled`, `RawFlow` writes flow in px/step, and `FlowFactorize` scales it to raw.
-    """
-    if not needs_unscaled:
-        return [RawFlow(**camera.options, **flows["raw"])] if "raw" in flows else []
-    raw = RawFlow(**camera.options, out_keys=_UNSCALED_KEY)
-    return [raw, _motion(_UNSCALED_KEY, camera)] if estimates_motion else [raw]
-
-
 def _estimated_flow(
-    flows: Mapping[str, Arguments], estimator: Arguments, camera: _Camera, estimates_motion: bool
+    flows: Mapping[str, Arguments],
+    estimator: Arguments,
+    camera: Arguments,
+    inputs: list[NestedKey],
+    estimates_motion: bool,
 ) -> list[Transform]:
     """Returns the transforms of picture pairs, flow and, with `estimates_motion`, camera motion.
 
-    obj needs flow that is compensated for the camera's motion. If the motion is estimated, too, it
-    is estimated from a first flow without compensation.
+    obj needs flow that is compensated for the camera's motion; `inputs` are the keys that it reads:
+    pictures, depth and motion. If the motion is estimated, too, it is estimated from a first flow
+    without compensation.
     """
     pictures = FrameStack(k=2, in_keys=[_PICTURE_KEY], out_keys=[_PICTURES_KEY])
-    has_raw = "raw" in flows
-    written: Arguments = {
-        "outputs": ["unscaled", "raw"] if has_raw else ["unscaled"],
-        "out_keys": [_ESTIMATED_FLOW_KEY, "raw"] if has_raw else [_ESTIMATED_FLOW_KEY],
-        **flows.get("raw", {}),
-    }
-    picture = _PICTURE_KEY
+    written: Arguments = {"outputs": ["unscaled"], "out_keys": [_ESTIMATED_FLOW_KEY]}
+    first = written
+    if "raw" in flows:
+        written = {"outputs": ["unscaled", "raw"], "out_keys": [_ESTIMATED_FLOW_KEY, "raw"]}
+        written |= flows["raw"]
+    motion = []
+    if estimates_motion:
+        motion = [_motion([_ESTIMATED_FLOW_KEY, inputs[1]], camera, _PICTURE_KEY)]
     if "obj" not in flows:
-        plain = EstimatedFlow(**estimator, **written, in_keys=_PICTURES_KEY)
-        motion = [_motion(_ESTIMATED_FLOW_KEY, camera, picture)] if estimates_motion else []
-        return [pictures, plain, *motion]
-    inputs = [_PICTURES_KEY, camera.depth, camera.motion]
-    compensated = EstimatedFlow(**estimator, **written, **camera.intrinsics, in_keys=inputs)
-    if not estimates_motion:
+        return [pictures, EstimatedFlow(**estimator, **written, in_keys=_PICTURES_KEY), *motion]
+    compensated = EstimatedFlow(**estimator, **written, **camera, in_keys=inputs)
+    if not motion:
         return [pictures, compensated]
     # A coarser estimate is enough for the camera's motion.
     coarser = {"preset": "medium"} if estimator.get("preset") == "fine" else {}
-    first = EstimatedFlow(
-        **estimator | coarser,
-        outputs=["unscaled"],
-        in_keys=_PICTURES_KEY,
-        out_keys=_ESTIMATED_FLOW_KEY,
-    )
-    return [pictures, first, _motion(_ESTIMATED_FLOW_KEY, camera, picture), compensated]
+    plain = EstimatedFlow(**estimator | coarser, **first, in_keys=_PICTURES_KEY)
+    return [pictures, plain, *motion, compensated]
 
 
-def _motion(flow: NestedKey, camera: _Camera, picture: NestedKey | None = None) -> Transform:
+def _motion(
+    in_keys: list[NestedKey], camera: Arguments, picture: NestedKey | None = None
+) -> Transform:
     """Returns the transform that estimates the camera's motion from flow and depth."""
-    return EstimateCameraMotion(
-        **camera.intrinsics,
-        picture=picture,
-        outputs=["motion"],
-        in_keys=[flow, camera.depth],
-        out_keys=[camera.motion],
-    )
-
-
-def _split(
-    factors: Mapping[str, Arguments], unscaled: NestedKey, camera: _Camera
-) -> list[Transform]:
-    """Returns one `FlowFactorize` for the flows that no source has written."""
-    if not factors:
-        return []
-    raw = [] if set(factors) == {"ego"} else [unscaled]
-    return [
-        FlowFactorize(
-            **camera.options,
-            outputs=list(factors),
-            scale={name: options["scale"] for name, options in factors.items()},
-            in_keys=[*raw, camera.depth, camera.motion],
-        )
-    ]
+    written: Arguments = {"outputs": ["motion"], "out_keys": [_ESTIMATED_MOTION_KEY]}
+    return EstimateCameraMotion(**camera, **written, picture=picture, in_keys=in_keys)
