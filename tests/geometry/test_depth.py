@@ -25,16 +25,6 @@ def test_depth_that_is_z_stays():
     assert adapt_depth(depth, "z") is depth
 
 
-def test_the_length_of_a_ray_becomes_its_z():
-    # Columns 0, 3 and 6 look along x = -0.75, 0 and 0.75, y = 0.5: the ray that reaches z = 1 is
-    # sqrt(1 + 0.5625 + 0.25) = 1.34629 and sqrt(1.25) = 1.11803 long.
-    length = depth_of(1.34629, 9.0, 9.0, 2.23607, math.inf, math.nan, 2.69258)
-    z = adapt_depth(length, "ray_length", K=CAMERA).flatten()
-    torch.testing.assert_close(z[[0, 3, 6]], torch.tensor([1.0, 2.0, 2.0]), atol=1e-5, rtol=0)
-    assert z[4] == math.inf
-    assert z[5].isnan()
-
-
 def test_ray_length_comes_back_from_points_with_skew_and_batch():
     depth = depth_map(2, 3)
     length = unproject(depth, K).norm(dim=-1).unsqueeze(-3)

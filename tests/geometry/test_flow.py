@@ -116,20 +116,6 @@ def test_ego_is_ego_flow_and_the_parts_add_up():
     assert torch.equal(obj, raw - ego)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_what_does_not_move_by_itself_has_exactly_no_object_flow(dtype):
-    depth, camera = depth_map(2).to(dtype), K.to(dtype)
-    depth[0, 0, 0, :2] = torch.tensor([INF, NAN])
-    instance = torch.zeros_like(depth, dtype=torch.uint8)
-    instance[..., 2:4, 3:6] = 1
-    motions = torch.stack([MOTION, OTHER_MOTION]).to(dtype).expand(2, 2, 4, 4)
-    raw, _ = rigid_flow(depth, instance, camera, motions)
-    _, obj, _ = factorize(raw, depth, camera, motions[:, 0])
-    static = (instance == 0).expand_as(obj)
-    assert obj[static].abs().max() == 0
-    assert obj[~static].abs().min() > 0
-
-
 def test_unknown_pixels_have_no_object_flow_and_say_so():
     raw, depth = raw_flow(), depth_map()
     depth[0, 0, 0] = NAN
@@ -174,11 +160,6 @@ def test_another_k_in_the_previous_frame_agrees_with_brute_force():
     torch.testing.assert_close(ego, each[0], rtol=0, atol=1e-12)
     assert valid.all()
     assert obj[:, instance[0] == 0].abs().max() == 0
-    # K of now for both frames, or the two exchanged, is off by pixels.
-    for wrong in ({}, {"prev_K": K}):
-        assert (ego_flow(depth, K, MOTION, **wrong).flow - ego).norm(dim=0).median() > 0.5
-    exchanged = ego_flow(depth, PREV_K, MOTION, prev_K=K).flow
-    assert (exchanged - ego).norm(dim=0).median() > 0.5
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

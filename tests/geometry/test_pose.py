@@ -141,10 +141,6 @@ def test_a_camera_of_a_left_handed_world_moves_as_it_did(axes):
     extrinsics = g.invert_rigid(torch.stack(poses))
     before, now = g.adapt_pose(extrinsics, axes=axes, direction="world_to_camera")
     torch.testing.assert_close(g.relative_motion(before, now, dtype=torch.float64), TURNED)
-    # Right-handed axes get it wrong: "ned" has the rise as a fall, "x_forward_z_up" the other side.
-    for rival in ("ned", "x_forward_z_up", "opengl", "opencv"):
-        before, now = g.adapt_pose(torch.stack(poses), axes=rival)
-        assert (g.relative_motion(before, now)[:3, 3] - TURNED[:3, 3]).abs().max() > 0.9
 
 
 def test_where_a_left_handed_world_s_camera_is_and_looks():

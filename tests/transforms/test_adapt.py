@@ -8,11 +8,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Categorical, Composite, Unbounded
-from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose
 
 from flowrep import transforms as T
-from tests.transforms.fake_env import INTRINSICS, FakeSensorEnv
+from tests.transforms.fake_env import INTRINSICS
 
 POSE = ("sensor", "world_from_cam")
 
@@ -78,24 +77,6 @@ def test_a_body_may_be_absent_but_a_camera_may_not(layout):
         adapt(td.clone())
     with pytest.raises(ValueError, match="pose"):
         adapt(TensorDict({"pose": absent[None]}, [1]))
-
-
-def test_a_simulator_that_knows_poses_alone_gets_the_flow_of_one_that_knows_motions():
-    keys = [("sensor", "depth"), ("sensor", "instance"), "motions"]
-    own = Compose(
-        T.CameraMotion(out_keys="motion"),
-        T.InstanceMotion(out_keys="motions"),
-        T.RawFlow(INTRINSICS, in_keys=keys),
-        T.FlowFactorize(INTRINSICS, in_keys=["raw", ("sensor", "depth"), "motion"]),
-    )
-    known = Compose(T.RawFlow(INTRINSICS), T.FlowFactorize(INTRINSICS))
-    got = TransformedEnv(FakeSensorEnv((3,)), own).rollout(6, break_when_any_done=False)
-    want = TransformedEnv(FakeSensorEnv((3,)), known).rollout(6, break_when_any_done=False)
-    for key in ("raw", "ego", "obj"):
-        torch.testing.assert_close(got[key], want[key], atol=2e-5, rtol=1e-5)
-    still = (got["sensor", "instance"] != 1).expand_as(got["obj"])
-    assert (got["obj"][still] == 0).all()  # exactly, though poses lie kilometres out
-    assert (got["obj"][:, 1:3][~still[:, 1:3]] != 0).any()
 
 
 def test_flow_with_channels_last_is_turned():

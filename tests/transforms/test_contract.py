@@ -291,13 +291,3 @@ def test_in_several_envs(make):
         env.close()
     for case in CASES.values():
         assert_right(td, case.oracles)
-
-
-@pytest.mark.parametrize("camera", [(INTRINSICS, None), (("sensor", "K"), ("sensor", "K"))])
-def test_a_copied_env_has_the_specs_of_its_original(camera):
-    options = dict(zip(("intrinsics", "prev_intrinsics"), camera))
-    stack = Compose(T.RawFlow(**options), T.FlowFactorize(**options, outputs=["valid", "obj"]))
-    env = TransformedEnv(FakeSensorEnv((3,)), stack)
-    copied = copy.deepcopy(env)
-    assert copied.observation_spec == env.observation_spec
-    assert torch.equal(copied.rollout(3)["obj"], env.rollout(3)["obj"])

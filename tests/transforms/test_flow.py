@@ -87,21 +87,6 @@ def test_whatever_the_float_types_raw_and_ego_round_alike(precision, other):
         assert obj.dtype == torch.promote_types(precision, torch.float32)
 
 
-def test_holes_and_unknown_raw_flow_are_0_and_marked():
-    td = RawFlow(K)(scene())
-    td["sensor", "depth"][0, 1, 0] = math.nan
-    td["raw"][1, 0, 1] = math.nan
-    outputs = ["ego", "obj", "raw", "valid"]
-    td = FlowFactorize(K, outputs=outputs, out_keys=["ego", "obj", "raw_out", "valid"])(td)
-    unknown = torch.zeros(1, 2, 4, dtype=torch.bool)
-    unknown[0, 1, 0] = unknown[0, 0, 1] = True
-    assert torch.equal(~td["valid"], unknown)
-    assert (td["obj"][:, unknown[0]] == 0).all()
-    assert (td["ego"][:, 1, 0] == 0).all()
-    assert td["ego"][0, 0, 1] == -2.0  # the camera's share is known without raw flow
-    assert td["raw_out"][1, 0, 1] == 0.0
-
-
 def overtaken() -> TensorDict:
     """Returns a wall at 5 m and three bodies before a camera that slid 0.5 m right, 0.25 m down.
 

@@ -6,12 +6,9 @@ env 1 have 4, so that in a batch one env starts anew while the other goes on.
 
 from __future__ import annotations
 
-import functools
-
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.collectors import Collector
 from torchrl.data import (
     Bounded,
     Categorical,
@@ -29,10 +26,8 @@ from torchrl.envs.transforms import (
 )
 
 from flowrep.transforms import Depth, FrameStack, Segmentation
-from tests.transforms import oracles
 from tests.transforms.fake_env import NUM_CLASSES, FakeSensorEnv, moment
 from tests.transforms.oracles import same_bits
-from tests.transforms.test_contract import assert_right
 
 KEY, STACK = ("sensor", "depth"), "depth3"
 
@@ -43,13 +38,6 @@ def stack_of_three() -> FrameStack:
 
 def stacked_single(env: int) -> TransformedEnv:
     return TransformedEnv(FakeSensorEnv((), env), stack_of_three())
-
-
-def test_a_collector_goes_on_where_its_last_batch_ended():
-    env = TransformedEnv(FakeSensorEnv((2,)), stack_of_three())
-    collector = Collector(env, frames_per_batch=2 * 3, total_frames=2 * 9)
-    batches = torch.cat([batch.clone() for batch in collector], -1)
-    assert_right(batches, {STACK: functools.partial(oracles.stacked, "depth", k=3)})
 
 
 def test_time_may_be_any_dimension_of_a_trajectory():
