@@ -158,6 +158,19 @@ def test_gradients(function):
     assert gradcheck(flow, (raw, depth, camera, motions, prev_camera))
 
 
+def test_a_point_level_with_the_previous_camera_sends_back_zero_not_nan():
+    # 2 m ahead after backing off by 2 m: its previous depth is exactly 0, flow there 0/0.
+    level = torch.eye(4, dtype=torch.float64)
+    level[2, 3] = -2.0
+    depth = torch.tensor([[[2.0, 5.0]]], dtype=torch.float64, requires_grad=True)
+    K_leaf, motion = leaves(K, level)
+    ego_flow(depth, K_leaf, motion).flow.sum().backward()
+    assert depth.grad[0, 0, 0].item() == 0.0
+    assert depth.grad[0, 0, 1].item() != 0.0
+    assert K_leaf.grad.isfinite().all()
+    assert motion.grad.isfinite().all()
+
+
 SIZE = 84
 
 
