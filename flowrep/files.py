@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import errno
 import io
+import math
 import os
 import secrets
 import shutil
@@ -104,6 +105,21 @@ def naming(path: Path) -> Iterator[None]:
 
 class TableError(ValueError):
     """A table is damaged, or another program's."""
+
+
+def whole_number(cell: str) -> int:
+    """Returns a cell's whole number; raises ValueError unless 64 bits hold it, as numpy's do."""
+    value = int(cell)
+    if abs(value) >= 2**63:
+        raise ValueError(f"{cell} has more than 64 bits")
+    return value
+
+
+def finite_number(cell: str) -> float:
+    """Returns a cell's number; raises ValueError for inf and nan."""
+    if not math.isfinite(value := float(cell)):
+        raise ValueError(f"{cell} is not finite")
+    return value
 
 
 def read_rows(

@@ -15,6 +15,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager
+from functools import wraps
 from itertools import product
 from pathlib import Path
 from typing import Any, NoReturn
@@ -40,6 +41,7 @@ from flowrep.config.options import Command, Model, validated
 from flowrep.config.usage import UsageError, closest_first
 
 EXIT_USAGE = 2
+_OF_JOB = "flowrep_job"  # an attribute of errors that a command raised, not Hydra's reading
 FOLDERS = ("resume", "run", "input", "output", "hydra.run.dir", "hydra.sweep.dir")
 """Keys whose values are folders, whose names may have any characters."""
 IS_DEBUGGING = bool(os.environ.get("HYDRA_FULL_ERROR"))
@@ -66,10 +68,19 @@ def run_hydra(config_name: str, job: Callable[[DictConfig], Any], schema: type[C
         sys.path.append(os.getcwd())  # for policies and classes in modules there, as with -m
     _show_if_asked(sys.argv[1:], config_name)
     main = hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name=config_name)
+
+    @wraps(job)
+    def marked(config: DictConfig) -> None:
+        try:
+            job(config)
+        except Exception as error:
+            error.__dict__[_OF_JOB] = True
+            raise
+
     try:
         typed = sys.argv[1:] = as_typed(sys.argv[1:], schema)
         with _composing(typed), env_override({"HYDRA_FULL_ERROR": "1"}):  # raise, don't print
-            main(job)()
+            main(marked)()
     except KeyboardInterrupt:
         sys.exit(130)
     except Exception as error:
@@ -86,10 +97,10 @@ def _composing(typed: Sequence[str]) -> Iterator[None]:
     except Exception as error:
         # A job ends with its own errors. The others are of a line of which Hydra can't make a
         # config, for instance since there is a list where it expects a name, and of any class.
+        if _OF_JOB in error.__dict__ or isinstance(error, UsageError):
+            raise
         text = explained(error)
         is_of_hydra = isinstance(error, HydraException | OmegaConfBaseException)
-        if is_a_mistake(error) and not is_of_hydra and not isinstance(error, OSError):
-            raise
         if isinstance(error, OSError) and not is_of_hydra:
             text += ": give another folder with hydra.run.dir="
         elif not isinstance(error, MissingConfigException) and not any(x in text for x in typed):

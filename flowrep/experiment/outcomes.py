@@ -16,7 +16,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from flowrep.files import read_rows
+from flowrep.files import finite_number, read_rows, whole_number
 
 if TYPE_CHECKING:
     import numpy as np
@@ -85,7 +85,8 @@ EVALUATION_COLUMNS = tuple(_FIELDS)
 
 _LATER = ("scene_id", "path")  # columns that older tables lack; they are read as empty
 _CHECKS: dict[str, Callable[[str], Any]] = {
-    "frames": int, "fps": float, "episode_seed": int, "length": int, "outcome": OUTCOMES.index,
+    "frames": whole_number, "fps": finite_number, "episode_seed": whole_number,
+    "length": whole_number, "outcome": OUTCOMES.index,
 }  # fmt: skip
 """How cells of evaluation.csv are checked: a misspelt outcome would count as a failure."""
 

@@ -9,9 +9,11 @@ from __future__ import annotations
 import json
 import os
 import platform
+import re
 import shutil
 import subprocess
 import uuid
+import zipfile
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -46,6 +48,7 @@ from flowrep.files import (
     refuse_link,
     replace_file,
     replace_text,
+    whole_number,
     write_rows,
 )
 
@@ -138,6 +141,9 @@ def cpu_name() -> str:
     return next(iter(names), platform.processor() or platform.machine())
 
 
+_MOST_BYTES = 2**30  # of unpacked drives: 2,000 bytes each for half a million episodes
+
+
 def read_drives(path: Path) -> dict[EpisodeKey, tuple[str, NDArray[np.float32]]]:
     """Returns each drive's outcome and positions `[T + 1, 2]`, x and y in metres.
 
@@ -151,6 +157,10 @@ def read_drives(path: Path) -> dict[EpisodeKey, tuple[str, NDArray[np.float32]]]
     if not path.is_file():
         return {}
     try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(part.file_size for part in archive.infolist())
+        if size > _MOST_BYTES:
+            raise ValueError(f"holds {size:,} bytes, more than {_MOST_BYTES:,}")
         with np.load(path, allow_pickle=False) as saved:
             names = zip(*(saved[column].tolist() for column in EpisodeKey._fields), strict=True)
             positions = np.split(saved["positions"].reshape(-1, 2), saved["starts"][1:-1])
@@ -209,6 +219,8 @@ class Loggers:
         if not kept.is_file():
             replace_text(kept, uuid.uuid4().hex[:12])
         name = kept.read_text(encoding="utf-8")
+        if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name):  # it becomes a part of paths
+            raise UsageError(f"{kept} does not hold a wandb run's id: restore or remove it")
 
         from torchrl.record.loggers.wandb import WandbLogger
 
@@ -374,7 +386,7 @@ class RunFolder:
 
     def read_metrics(self) -> list[dict[str, str]]:
         """Returns the rows of metrics.csv, none if there is no such file."""
-        return read_rows(self.metrics_path, ["frames"], {"frames": int})
+        return read_rows(self.metrics_path, ["frames"], {"frames": whole_number})
 
     def read_episodes(self) -> list[dict[str, str]]:
         """Returns the rows of evaluation.csv, none if there is no such file."""
