@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from benchmarks.diagnosis import CAMERA, Shots, euler, flow_of, rays_of, rigid
+from benchmarks.shots import CAMERA, Shots, euler, flow_of, rays_of, rigid
 
 Mistake = Callable[[Shots, np.random.Generator], Shots]
 

@@ -1,6 +1,6 @@
 """Sweeps: `python -m flowrep.train -m seed=0,1,2` trains a run for each job, each in a folder.
 
-A job trains in a process of its own, see `flowrep.train.run_of_sweep`. If its run has begun
+A job trains in a process of its own, see `flowrep.train.run_sweep_job`. If its run has begun
 already, that resumes it, and if its final evaluation is done, there is nothing to do. So the same
 command continues a sweep, whatever stopped it. Hydra's launchers (one run after the other, joblib,
 SLURM, Ray) call `job` in their workers, so this module imports no PyTorch.
@@ -38,14 +38,16 @@ from flowrep.files import open_to_append
 from flowrep.progress import STOP_SIGNALS, StopRequest
 
 register_resolvers()  # for the paths in conf/run_folder.yaml, which a worker resolves too
-if multiprocessing.current_process().name != "MainProcess":  # a pool's worker composes its jobs
+if multiprocessing.current_process().name != "MainProcess":
+    # A launcher's pool worker composes its jobs itself, so their files are checked here; never
+    # left, because the process does nothing else.
     _CHECKED = checked_files()
     _CHECKED.__enter__()
 
 LOG = "job.log"
 STOP = ".stop"
 """A file in a sweep's folder that makes its jobs, on any machine, save and stop."""
-TRAIN = "from flowrep.train import run_of_sweep; run_of_sweep()"
+TRAIN = "from flowrep.train import run_sweep_job; run_sweep_job()"
 POLL_S = 0.5
 # A process whose parent ends gets another one: so a worker notices that its launcher was killed.
 PARENT = os.getppid()

@@ -63,15 +63,15 @@ def run(config: TrainConfig) -> float:
     if config.resume is not None:
         folder = RunFolder.existing(config.resume)
         with folder.held(PATIENCE_S):
-            return finish(resumed(config, folder, typed), folder)
+            return run_in_folder(resumed(config, folder, typed), folder)
     folder = RunFolder(job.runtime.output_dir)
     with folder.held():
         folder.check_is_new()
         announce(config, settings_of(job.runtime.choices))
-        return finish(config, folder, typed)
+        return run_in_folder(config, folder, typed)
 
 
-def run_of_sweep() -> None:
+def run_sweep_job() -> None:
     """Begins or resumes the run that `sweep.job` describes on stdin, and has checked."""
     from flowrep.experiment.run import RunFolder
 
@@ -86,7 +86,7 @@ def run_of_sweep() -> None:
             else:
                 folder.check_is_new()
                 announce(config, asked["settings"])
-            finish(config, folder, asked["typed"])
+            run_in_folder(config, folder, asked["typed"])
     except Exception as error:
         end_with(error)
 
@@ -145,7 +145,7 @@ def announce(config: TrainConfig, settings: str) -> None:
         )
 
 
-def finish(config: TrainConfig, folder: RunFolder, typed: Iterable[str] = ()) -> float:
+def run_in_folder(config: TrainConfig, folder: RunFolder, typed: Iterable[str] = ()) -> float:
     """Runs what remains of a run (training, evaluation, video) and returns its success.
 
     Its config is written once everything could be built: what fails before leaves no run behind.
@@ -165,7 +165,7 @@ def finish(config: TrainConfig, folder: RunFolder, typed: Iterable[str] = ()) ->
             folder.lengthen(config.total_frames)
         print(f"run folder: {folder.path}")
         try:
-            is_evaluated = complete(runner, stop)
+            is_evaluated = train_evaluate_film(runner, stop)
         except (CheckpointError, DivergenceError, WorkerError, OSError) as error:
             may_go_on = not isinstance(error, DivergenceError)
             exit_with(
@@ -179,7 +179,7 @@ def finish(config: TrainConfig, folder: RunFolder, typed: Iterable[str] = ()) ->
     return success_of(folder.path)
 
 
-def complete(runner: Runner, stop: StopRequest) -> bool:
+def train_evaluate_film(runner: Runner, stop: StopRequest) -> bool:
     """Trains and evaluates, unless that is done already; returns whether all is done."""
     config, folder = runner.config, runner.folder
     if is_finished(folder.path, config):

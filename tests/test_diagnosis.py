@@ -16,8 +16,9 @@ import torch
 
 pytest.importorskip("cv2", reason="recordings need OpenCV")
 
-from benchmarks.diagnosis import draw, examined, found_of, frames_of, outcome, tensordict_of
+from benchmarks.diagnosis import examined, found_of, outcome, tensordict_of
 from benchmarks.mistakes import FLU, LISTED, OPENGL, UNLISTED
+from benchmarks.shots import draw, frames_of
 from flowrep import diagnose, diagnosis, geometry, transforms
 from flowrep.diagnosis import Examination
 from flowrep.diagnosis.rivals import rivals_of

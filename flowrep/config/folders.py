@@ -15,7 +15,7 @@ OF_THE_MACHINE = ("device", "num_workers", "threads")
 
 def register_resolvers() -> None:
     """Registers the functions that conf/ calls to name folders, such as `${run_name:scene,...}`."""
-    for resolver in (run_name, folder_name, run_of_sweep, unless_resumed):
+    for resolver in (run_name, folder_name, sweep_run_name, unless_resumed):
         OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
 
 
@@ -49,14 +49,14 @@ def folder_name(text: str) -> str:
     return name.encode()[:200].decode(errors="ignore").lstrip(".") or "_"
 
 
-def run_of_sweep(overrides: Iterable[str]) -> str:
+def sweep_run_name(overrides: Iterable[str]) -> str:
     """Returns the name of a sweep's run's folder, which needs no quotes in a shell or in Hydra.
 
     Settings of the machine are left out.
 
-    >>> run_of_sweep(["seed=0", "scene=s_turn", "representations=[ego,obj]", "device=cpu"])
+    >>> sweep_run_name(["seed=0", "scene=s_turn", "representations=[ego,obj]", "device=cpu"])
     's_turn_ego+obj_s0'
-    >>> run_of_sweep(["preset=laptop", "algorithm.tau=0.01", "seed=1"])
+    >>> sweep_run_name(["preset=laptop", "algorithm.tau=0.01", "seed=1"])
     'laptop_s1_algorithm.tau-0.01'
     """
 

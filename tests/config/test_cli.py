@@ -322,10 +322,10 @@ def test_a_name_becomes_a_visible_folder_in_the_output_folder(name):
 
 def test_names_of_a_sweeps_runs_need_no_quotes_and_stay_apart():
     odd = ["+note='a b/../c'", "representations=[ego,obj]", "~debug", "num_workers=2"]
-    assert folders.run_of_sweep(odd) == "ego+obj_note-ab_.._c__debug"
+    assert folders.sweep_run_name(odd) == "ego+obj_note-ab_.._c__debug"
     long = ["seed=3", *(f"evaluation.some_long_key_{i}=123456" for i in range(9))]
     other = [*long[:-1], "evaluation.some_long_key_8=123457"]
-    names = {folders.run_of_sweep(long), folders.run_of_sweep(other)}
+    names = {folders.sweep_run_name(long), folders.sweep_run_name(other)}
     assert len(names) == 2
     assert all(name.startswith("s3_") and len(name) < 120 for name in names)
 

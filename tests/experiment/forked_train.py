@@ -62,7 +62,7 @@ def carry_on(run, printed, kill_at=None, largest_file=None):
             resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
         folder = RunFolder.existing(run)
         config = validated_run(folder.read_config(), "config.yaml")
-        flowrep.train.finish(config.model_copy(update={"resume": str(run)}), folder)
+        flowrep.train.run_in_folder(config.model_copy(update={"resume": str(run)}), folder)
     except SystemExit as end:
         if isinstance(end.code, str):
             print(end.code, file=sys.stderr)

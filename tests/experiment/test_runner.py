@@ -16,8 +16,7 @@ from flowrep.experiment import build
 from flowrep.experiment.run import RunFolder, RunFolderError
 from flowrep.experiment.runner import Every, Means, RecentEpisodes, Runner, progress_text
 from flowrep.progress import StopRequest
-from flowrep.train import finish as finish_run
-from flowrep.train import resumed
+from flowrep.train import resumed, run_in_folder
 from tests.comparing import differing
 from tests.config.composing import composed, plain
 
@@ -166,7 +165,7 @@ def test_a_run_that_can_not_be_resumed_has_not_become_longer(tmp_path):
     folder.checkpoint_path.write_bytes(b"damaged")
     typed = [f"resume={tmp_path}", "total_frames=512"]
     with pytest.raises(CheckpointError):
-        finish_run(resumed(composed(*typed), folder, typed), folder)
+        run_in_folder(resumed(composed(*typed), folder, typed), folder)
     assert folder.config().total_frames == 256
 
 
