@@ -70,9 +70,12 @@ def diagnose(
 
     >>> from tensordict import TensorDict
     >>> K = torch.tensor([[50.0, 0.0, 30.0], [0.0, 50.0, 20.0], [0.0, 0.0, 1.0]])
-    >>> slope, prev_from_curr = 1 + (torch.arange(60) + 0.5 - 30) / 100, torch.eye(4)
-    >>> prev_from_curr[2, 3] = 0.1  # the camera moves ahead, to a wall that is oblique
-    >>> depth = torch.stack([(4 - 0.1 * t) / slope.expand(1, 40, 60) for t in range(16)])
+    >>> x, y = (torch.arange(60) - 29.5) / 50, (torch.arange(40)[:, None] - 19.5) / 50
+    >>> near = (y / 0.4).maximum(-x / 0.6)  # the inverse depth of the floor and of a wall beside
+    >>> inverse = [near.maximum((1 + x / 2) / (4 - 0.1 * t)) for t in range(16)]  # a wall ahead
+    >>> depth = torch.stack(inverse)[:, None].reciprocal()
+    >>> prev_from_curr = torch.eye(4)
+    >>> prev_from_curr[2, 3] = 0.1  # the camera moves ahead
     >>> sensor = {"depth": depth, "prev_from_curr": prev_from_curr.repeat(16, 1, 1)}
     >>> diagnose(TensorDict({"sensor": sensor}, [16]), K).verdict
     'right'

@@ -311,7 +311,7 @@ class StreetEnv(gym.Env):
 
     def drive(self, action: int) -> Outcome:
         """Drives one step like `step`, without an observation."""
-        episode = self.episode
+        episode = self._opened()
         if action not in range(len(YAW_SIGN)):
             raise ValueError(
                 f"action is {action!r}; give 0 (keep the yaw rate), 1 (turn left) or 2 (turn right)"
@@ -323,15 +323,20 @@ class StreetEnv(gym.Env):
 
     def render(self) -> Any:
         """Returns the camera's picture, [H, W, 3] uint8, if the render mode is "rgb_array"."""
-        episode = self.episode
+        episode = self._opened()
         return None if self.render_mode is None else self.sensing.rgb(episode)
 
     def close(self) -> None:
         """Releases the street, whose simulator closes with the last env that uses it.
 
-        `reset` opens it again.
+        `reset` opens it again; until then only the state of the episode remains.
         """
-        self.sensing = self._street = self._episode = None  # type: ignore[assignment]
+        self.sensing = self._street = None  # type: ignore[assignment]
+
+    def _opened(self) -> Episode:
+        if self._street is None:
+            raise RuntimeError("the env is closed: call reset() first")
+        return self.episode
 
     def _open(self) -> None:
         self._street = Street.shared(self.scene)

@@ -1,7 +1,4 @@
-"""The camera of a street: its K, its mount, and what the depth buffer means.
-
-That pictures are sampled at this K is tested with `BulletCamera`, and that both renderers agree.
-"""
+"""The renderer is asked, not believed: where it samples, and what its depth means."""
 
 import math
 
@@ -9,9 +6,57 @@ import numpy as np
 import pytest
 
 from flowrep.scenes.scene import CameraConfig
-from flowrep.simulator.camera import depth_from_zbuffer, vehicle_from_camera
+from flowrep.simulator.bullet import Simulator
+from flowrep.simulator.camera import (
+    depth_from_zbuffer,
+    gl_projection,
+    gl_view,
+    sampled_intrinsics,
+    vehicle_from_camera,
+)
+from flowrep.simulator.meshes import Mesh
+from flowrep.simulator.paint import swatch, texture
 
 NEAR_M, FAR_M = 0.2, 300.0
+CAMERAS = [(36, 60, 40.0), (84, 84, 42.0), (61, 48, 55.0)]  # height, width, focal length
+
+
+@pytest.fixture(scope="module")
+def slanted_plane():
+    """A plane whose z in the camera grows to the right and upwards: 0.6 x - 0.5 y - z = -6."""
+    simulator = Simulator(texture())
+    # The camera's frame is the world's here: z forward. Corners on z = 6 + 0.6 x - 0.5 y.
+    corners = [(x, y, 6 + 0.6 * x - 0.5 * y) for x, y in ((-5, 5), (5, 5), (5, -5), (-5, -5))]
+    mesh = Mesh()
+    mesh.quad(np.array(corners, dtype=float), swatch("asphalt"))
+    simulator.add_body(mesh)
+    return simulator
+
+
+def relative_depth_error(simulator, size, principal_point):
+    height, width, focal_px = size
+    projection = gl_projection(focal_px, height, width, NEAR_M, FAR_M)
+    seen = simulator.look(gl_view(np.eye(4)), projection, height, width)
+    depth = depth_from_zbuffer(seen.zbuffer, NEAR_M, FAR_M)
+    cx, cy = principal_point
+    x = (np.arange(width) + 0.5 - cx) / focal_px  # pixel (0, 0)'s centre is (0.5, 0.5)
+    y = (np.arange(height)[:, None] + 0.5 - cy) / focal_px
+    # z = 6 + 0.6 x z - 0.5 y z on the ray (x, y, 1) z.
+    inverse_truth = (1.0 - 0.6 * x + 0.5 * y) / 6.0
+    error = np.abs(depth * inverse_truth - 1.0)
+    hit = seen.body >= 0
+    assert hit.mean() > 0.5
+    return float(np.median(error[hit]))
+
+
+@pytest.mark.parametrize("size", CAMERAS)
+def test_the_sampled_intrinsics_put_unprojected_points_on_the_surface(slanted_plane, size):
+    height, width, focal_px = size
+    K = sampled_intrinsics(focal_px, focal_px, height, width)
+    assert relative_depth_error(slanted_plane, size, (K[0, 2], K[1, 2])) < 3e-6
+    # Rivals: the centred camera gives about 1e-2, the shift taken the other way twice that.
+    for cx, cy in ((width / 2, height / 2), (width / 2 - 0.5, height / 2 + 0.5)):
+        assert relative_depth_error(slanted_plane, size, (cx, cy)) > 5e-3
 
 
 def test_depth_buffer_ends_are_near_and_far():
@@ -25,7 +70,7 @@ def test_the_focal_length_follows_the_vertical_field_of_view():
     # Half of 48 rows over tan(30°): 24 / 0.57735 = 41.569; the width plays no part.
     camera = CameraConfig(48, 100, 60.0, 1.5, 0.0, 0.0, NEAR_M, FAR_M)
     assert camera.focal_px == pytest.approx(24 * math.sqrt(3))
-    # cx, cy are half a pixel right of the middle and above it: see PRINCIPAL_POINT_SHIFT_PX.
+    # The principal point is half a pixel right of the middle and above it, as measured above.
     f = camera.focal_px
     np.testing.assert_array_equal(camera.K, [[f, 0, 50.5], [0, f, 23.5], [0, 0, 1]])
 

@@ -138,3 +138,17 @@ def test_motions_are_the_identity_at_reset(drive):
     assert torch.equal(frame["prev_from_curr"], torch.eye(4))
     assert torch.equal(frame["instance_motion"], torch.eye(4).expand_as(frame["instance_motion"]))
     assert not ego_flow(frame["depth"], frame["K"], frame["prev_from_curr"]).flow.any()
+
+
+def test_legs_have_a_motion_of_their_own(drive):
+    differ = 0
+    for frame in drive(ACTIONS[:20]):
+        obj = flows(frame)[2][0]
+        instance = frame["instance"][0].long()
+        for person in range(int(instance.max()) // 3):
+            body, left, right = (obj[instance == 3 * person + part] for part in (1, 2, 3))
+            if min(len(body), len(left), len(right)) > 60:
+                means = torch.stack([left.mean(), right.mean()]) - body.mean()
+                # One leg swings forwards while the other swings back.
+                differ += bool((means.sign().prod() < 0) & (means.abs() > 0.05).all())
+    assert differ > 3

@@ -27,6 +27,7 @@ from flowrep.envs import (
 )
 from flowrep.envs.sensing import SENSORS
 from flowrep.scenes import SceneError, load_scene
+from flowrep.scenes.scene import CATEGORY_ID
 from flowrep.transforms import Depth, FlowFactorize, RawFlow
 from tests.comparing import differing
 
@@ -325,3 +326,14 @@ def test_the_order_of_episodes_does_not_depend_on_the_policy(make):
     drawn = seeds(left)
     assert drawn == seeds(2 * left)
     assert drawn[0] != drawn[1]
+
+
+def test_hit_is_the_class_of_what_the_vehicle_hit(make):
+    env = make(representations=(), num_envs=3, seed=1)
+    steps, _ = play(env, torch.zeros(200, 3, dtype=torch.long))
+    outcome, hit = steps["next", "outcome"], steps["next", "hit"]
+    collided = outcome == Outcome.COLLISION
+    assert collided.any()
+    # Straight on, only people are in the way.
+    assert set(hit[collided].tolist()) == {CATEGORY_ID["pedestrian"]}
+    assert (hit[~collided] == 255).all()

@@ -35,6 +35,14 @@ def moved(x=0.0, y=0.0, z=0.0) -> torch.Tensor:
     return prev_from_curr
 
 
+def test_sideways_by_hand():
+    # The camera went 0.5 m right and 0.25 m down. At 4 m: u = -4 * 0.5/4, v = -8 * 0.25/4. With fx
+    # and fy swapped (-1, -0.25); with curr_from_prev, or previous minus current, (0.5, 0.5).
+    flow, valid = ego_flow(torch.full((1, 1, 1), 4.0), camera(), moved(x=0.5, y=0.25))
+    assert flow.flatten().tolist() == [-0.5, -0.5]
+    assert valid.all()
+
+
 def test_forwards_by_hand():
     # The camera went 1 m forward, so what stands at 4 m stood at 5 m. Pixel (1, 0) lies (0.5, 0.25)
     # from the principal point and lay at 4/5 of that: flow is a fifth of it, outwards. On the
@@ -209,3 +217,17 @@ def test_any_batch_equals_a_loop(function, batch):
     one_camera = function(*maps, K, motions)
     for part, other in zip(one_camera, function(*maps, K.expand_as(Ks), motions)):
         assert torch.equal(part, other)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_what_does_not_move_by_itself_has_exactly_no_object_flow(dtype):
+    depth, camera = depth_map(2).to(dtype), K.to(dtype)
+    depth[0, 0, 0, :2] = torch.tensor([INF, NAN])
+    instance = torch.zeros_like(depth, dtype=torch.uint8)
+    instance[..., 2:4, 3:6] = 1
+    motions = torch.stack([MOTION, OTHER_MOTION]).to(dtype).expand(2, 2, 4, 4)
+    raw, _ = rigid_flow(depth, instance, camera, motions)
+    _, obj, _ = factorize(raw, depth, camera, motions[:, 0])
+    static = (instance == 0).expand_as(obj)
+    assert obj[static].abs().max() == 0
+    assert obj[~static].abs().min() > 0

@@ -25,6 +25,24 @@ def test_float_types_may_differ(transform, points):
     assert points_world.tolist() == [[13.25, -0.5, -2.0]]
 
 
+def test_transform_points_by_hand():
+    # About z by a quarter turn, x goes to y: (1, 0, 0) -> (0, 1, 0), then + (10, 20, 30).
+    a_from_b = rigid((0.0, 0.0, QUARTER_TURN), (10.0, 20.0, 30.0))
+    points_a = g.transform_points(a_from_b, torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64))
+    # The inverse rotation would give (10, 19, 30).
+    torch.testing.assert_close(points_a[0].tolist(), [10.0, 21.0, 30.0])
+
+
+def test_relative_motion_by_hand():
+    # Both cameras look along world y (their z); the current one stands 2 m further on.
+    world_from_prev = rigid((-QUARTER_TURN, 0.0, 0.0), (5.0, 1.0, 0.0))
+    world_from_curr = rigid((-QUARTER_TURN, 0.0, 0.0), (5.0, 3.0, 0.0))
+    prev_from_curr = g.relative_motion(world_from_prev, world_from_curr)
+    # What the current camera sees 0 m ahead was 2 m ahead. curr_from_prev would have -2.
+    torch.testing.assert_close(prev_from_curr[:3, 3].tolist(), [0.0, 0.0, 2.0])
+    torch.testing.assert_close(prev_from_curr[:3, :3], torch.eye(3))
+
+
 def test_invert_rigid_by_hand():
     a_from_b = rigid((0.0, 0.0, QUARTER_TURN), (10.0, 20.0, 30.0))
     # b's x axis is a's y axis: a's origin lies at -(20, -10, 30) in b. -t alone: (-10, -20, -30).
