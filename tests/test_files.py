@@ -155,3 +155,11 @@ def test_a_table_is_replaced_as_a_whole(tmp_path):
     assert read_rows(table) == [{"a": "3"}]
     write_rows(table, [])
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_cell_that_64_bits_do_not_hold_or_that_is_not_finite_is_named_with_its_row(tmp_path):
+    path = tmp_path / "table.csv"
+    for cell, check in (("9" * 26, files.whole_number), ("1e999", files.finite_number)):
+        path.write_text(f"frames\n1\n{cell}\n")
+        with pytest.raises(files.TableError, match=f"frames is '{cell}' in row 2"):
+            files.read_rows(path, ["frames"], {"frames": check})
