@@ -90,7 +90,7 @@ test-lowest: $(DEVELOPED)  ## Run the fast tests with the oldest packages that p
 	@touch .venv-lowest/.installed .venv-lowest/.developed
 	$(MAKE) test-fast ENV=.venv-lowest
 
-schema: $(INSTALLED)  ## Write what editors and docs/scenes.md say about the keys of scene files
+schema: $(INSTALLED)  ## Write what editors say about the keys of scene files
 	$(BIN)/python -m docs.scene_keys
 
 lint: $(DEVELOPED)  ## Check style, formatting and spelling

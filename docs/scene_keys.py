@@ -1,7 +1,6 @@
-"""Writes what editors and docs/scenes.md say about the keys of a scene, from their docstrings."""
+"""Writes the schema from which editors show the keys of a scene, made of their docstrings."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -10,8 +9,7 @@ from pydantic import TypeAdapter
 
 from flowrep.scenes.scene import Part, Scene
 
-PAGE, SCHEMA = (Path(__file__).parent / name for name in ("scenes.md", "scene.schema.json"))
-MARKS = "<!-- make schema: -->\n", "<!-- end -->\n"
+SCHEMA = Path(__file__).parent / "scene.schema.json"
 
 
 def schema() -> dict[str, Any]:
@@ -39,25 +37,5 @@ def lines(node: Any, depth: int = 4, indent: str = "") -> str:
     return "{\n" + ",\n".join(parts) + f"\n{indent}}}"
 
 
-def rows(part: dict[str, Any], parts: dict[str, Any], prefix: str = "") -> Iterator[str]:
-    """Yields a row of the page's table for each key, with those within it below."""
-    for key, field in part["properties"].items():
-        inner = next((name for name in parts if f"/{name}'" in str(field)), None)
-        described = (parts[inner] if inner else field)["description"]
-        yield f"| `{prefix}{key}` | {' '.join(described.split())} |\n"
-        if inner:
-            yield from rows(parts[inner], parts, f"{prefix}{key}.")
-
-
-def page(text: str) -> str:
-    """Returns the page with the table between its marks."""
-    before, _, rest = text.partition(MARKS[0])
-    after = rest.partition(MARKS[1])[2]
-    whole = schema()
-    table = "".join(["\n| key | meaning |\n| --- | --- |\n", *rows(whole, whole["$defs"]), "\n"])
-    return before + MARKS[0] + table + MARKS[1] + after
-
-
 if __name__ == "__main__":
     SCHEMA.write_text(lines(schema()) + "\n", "utf-8")
-    PAGE.write_text(page(PAGE.read_text("utf-8")), "utf-8")

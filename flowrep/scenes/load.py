@@ -98,7 +98,7 @@ def _complaint(error: ValidationError) -> str:
     first = min(error.errors(), key=lambda each: each["type"] != "unexpected_keyword_argument")
     key = "".join(f"[{at}]" if isinstance(at, int) else f".{at}" for at in first["loc"])[1:]
     if first["type"] == "unexpected_keyword_argument":
-        return f"{key}: unknown key; the keys are in docs/scenes.md"
+        return f"{key}: unknown key; the keys are in docs/scene.schema.json"
     problem = first["msg"].removeprefix("Value error, ")
     given = "" if first["type"] == "missing" else f"; got {first['input']!r:.60}"
     return f"{key}: {problem}{given}"

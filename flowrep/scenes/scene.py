@@ -101,8 +101,8 @@ SpeedRange = Annotated[tuple[NotNegative, NotNegative], AfterValidator(_in_order
 HouseRange = Annotated[tuple[HouseSide, HouseSide], AfterValidator(_in_order)]
 
 
-# `docs/scene_keys.py` makes the descriptions that editors and docs/scenes.md show of the docstrings
-# of classes and fields.
+# `docs/scene_keys.py` makes the descriptions that editors show of the docstrings of classes and
+# fields.
 
 
 class Part:
