@@ -131,7 +131,7 @@ def evaluate_one(
     finally:
         if records := evaluation.records(**origin):
             try:
-                folder.log_episodes(records, drives=True)
+                folder.log_episodes(records)
             except OSError as error:
                 raise OSError(f"{folder.path}: {error}; then evaluate again") from error
             print(folder.path)

@@ -65,7 +65,7 @@ class EpisodeRecord:
     hit: str  # the category that was hit, or ""
     return_: float  # undiscounted sum of rewards
     length: int  # the number of steps T
-    # The vehicle's x and y in metres, `[T + 1, 2]`; stored in drives.npz.
+    # The vehicle's x and y in metres, `[T + 1, 2]`.
     positions: NDArray[np.float32] = field(repr=False, compare=False)
 
     @property

@@ -13,7 +13,6 @@ import re
 import shutil
 import subprocess
 import uuid
-import zipfile
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -23,10 +22,8 @@ from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import yaml
 from filelock import FileLock, Timeout
-from numpy.typing import NDArray
 
 from flowrep import __version__
 from flowrep.config.usage import UsageError
@@ -41,12 +38,10 @@ from flowrep.experiment.outcomes import (
 from flowrep.experiment.schema import TrainConfig, validated_run
 from flowrep.extras import require
 from flowrep.files import (
-    TableError,
     append_rows,
     naming,
     read_rows,
     refuse_link,
-    replace_file,
     replace_text,
     whole_number,
     write_rows,
@@ -65,7 +60,6 @@ class FolderInUseError(OSError):
     """Another process works in the folder."""
 
 
-DRIVES = "drives.npz"
 _TIMES = ("started", "ended")
 
 _IDENTITY = (
@@ -139,35 +133,6 @@ def cpu_name() -> str:
     lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return next(iter(names), platform.processor() or platform.machine())
-
-
-_MOST_BYTES = 2**30  # of unpacked drives: 2,000 bytes each for half a million episodes
-
-
-def read_drives(path: Path) -> dict[EpisodeKey, tuple[str, NDArray[np.float32]]]:
-    """Returns each drive's outcome and positions `[T + 1, 2]`, x and y in metres.
-
-    Without a file there are none. It holds the columns of `EpisodeKey`; `outcome`; `positions`
-    `[sum of T + 1, 2]`; and `starts` `[N + 1]`, so that drive n is
-    `positions[starts[n]:starts[n + 1]]`.
-
-    Raises:
-        TableError: the file is damaged.
-    """
-    if not path.is_file():
-        return {}
-    try:
-        with zipfile.ZipFile(path) as archive:
-            size = sum(part.file_size for part in archive.infolist())
-        if size > _MOST_BYTES:
-            raise ValueError(f"holds {size:,} bytes, more than {_MOST_BYTES:,}")
-        with np.load(path, allow_pickle=False) as saved:
-            names = zip(*(saved[column].tolist() for column in EpisodeKey._fields), strict=True)
-            positions = np.split(saved["positions"].reshape(-1, 2), saved["starts"][1:-1])
-            driven = zip(saved["outcome"].tolist(), positions, strict=True)
-            return dict(zip(map(EpisodeKey._make, names), driven, strict=True))
-    except Exception as error:  # zip, zlib and numpy fail on garbage in a dozen ways
-        raise TableError(f"{path} is damaged ({error}): restore or remove it") from error
 
 
 class Loggers:
@@ -244,7 +209,6 @@ class RunFolder:
         self.metrics_path = self.path / "metrics.csv"
         self.checkpoint_path = self.path / "checkpoint" / "latest.safetensors"
         self.evaluation_path = self.path / "evaluation.csv"
-        self.drives_path = self.path / DRIVES
         self.loggers = Loggers(self.path)
 
     @classmethod
@@ -392,14 +356,9 @@ class RunFolder:
         """Returns the rows of evaluation.csv, none if there is no such file."""
         return read_episodes(self.evaluation_path)
 
-    def log_episodes(self, records: Sequence[EpisodeRecord], *, drives: bool = False) -> None:
-        """Saves evaluated episodes, and logs their means to TensorBoard and wandb.
-
-        With `drives`, the vehicle's positions are saved, too.
-        """
-        self.save_episodes(records)  # first: they took hours, and positions are only for pictures
-        if drives:
-            self._save_drives(records)
+    def log_episodes(self, records: Sequence[EpisodeRecord]) -> None:
+        """Saves evaluated episodes, and logs their means to TensorBoard and wandb."""
+        self.save_episodes(records)
         self.loggers.log_episodes(records)
 
     def save_episodes(self, records: Iterable[EpisodeRecord]) -> None:
@@ -412,16 +371,3 @@ class RunFolder:
         again = {identity(row) for row in new}
         kept = [row for row in self.read_episodes() if identity(row) not in again]
         write_rows(self.evaluation_path, [*kept, *new], EVALUATION_COLUMNS)
-
-    def _save_drives(self, records: Iterable[EpisodeRecord]) -> None:
-        """Adds the vehicles' positions to drives.npz; they replace those of the same episodes."""
-        drives = read_drives(self.drives_path)
-        for each in records:
-            drives[each.key] = each.outcome, each.positions
-        outcomes, positions = zip(*drives.values())
-        arrays: dict[str, Any] = dict(zip(EpisodeKey._fields, map(np.array, zip(*drives))))
-        arrays["outcome"], arrays["positions"] = np.array(outcomes), np.concatenate(positions)
-        arrays["starts"] = np.cumsum([0, *map(len, positions)])
-        # Ragged tracks as one flat array: an array of objects would need pickle to be read.
-        with replace_file(self.drives_path) as partial:
-            np.savez_compressed(partial, **arrays)

@@ -184,7 +184,7 @@ class Runner:
         if evaluation.done < evaluation.total:
             return False
         records = evaluation.records(**driver.origin(kind))
-        self.folder.log_episodes(records, drives=kind == "final")
+        self.folder.log_episodes(records)
         self.folder.note_machine(self.machine)
         if kind == "final":
             print_results([record.row() for record in records])

@@ -15,7 +15,7 @@ require("a report", "report", "hydra", "pydantic", "matplotlib", "scipy", "jinja
 from pydantic import Field
 
 from flowrep.config.cli import run_command
-from flowrep.config.options import Command, CountOrZero, OneOrMore, Text
+from flowrep.config.options import Command, OneOrMore, Text
 from flowrep.config.usage import UsageError
 from flowrep.files import refuse_link, replace_text
 
@@ -26,8 +26,6 @@ class ReportConfig(Command):
     run: Annotated[list[Text], Field(min_length=1), OneOrMore]
     output: Text | None
     policy: Literal["greedy", "sampled"]
-    trajectories: CountOrZero
-    videos: CountOrZero
 
 
 def report(config: ReportConfig) -> Path:
@@ -45,7 +43,7 @@ def report(config: ReportConfig) -> Path:
     if not runs:
         raise UsageError("none of the runs can be read, see above")
 
-    from flowrep.report.page import plans_and_films_of, render_page, summary
+    from flowrep.report.page import render_page, summary
     from flowrep.report.sections import assemble, write_files
 
     print(summary(runs))
@@ -61,11 +59,8 @@ def report(config: ReportConfig) -> Path:
     output.mkdir(parents=True, exist_ok=True)
     for folder in write_files(assembled, output):
         print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
-    drives = plans_and_films_of(runs, trajectories=config.trajectories, videos=config.videos)
-    for warning in drives.warnings:
-        print(f"drives: {warning}")
     page = output / "index.html"
-    replace_text(page, render_page(assembled, drives))
+    replace_text(page, render_page(assembled))
     print(f"page: {page}")
     return page
 

@@ -7,7 +7,7 @@ files, byte for byte.
 import io
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from itertools import cycle, pairwise
+from itertools import cycle, pairwise, product
 from typing import Any, NamedTuple
 
 import matplotlib as mpl
@@ -19,23 +19,6 @@ from matplotlib.patches import Patch
 from flowrep.report.runs import SCENES, Curve, SuccessGrid, mean_curve
 from flowrep.report.statistics import Estimate
 
-# Okabe and Ito's colours for single maps and for ego + object flow. Flows with another map have a
-# darker colour of that map's hue, and a hatch or a dashed line.
-_COLOURS = {
-    "ego": "#e69f00",
-    "raw": "#56b4e9",
-    "obj": "#009e73",
-    "ego+obj": "#0072b2",
-    "seg2": "#d55e00",
-    "depth2": "#cc79a7",
-    "ego+obj+seg2": "#8a3c00",
-    "ego+obj+depth2": "#7d3f66",
-    "ego+obj+seg2+depth2": "#4a4a4a",
-}
-_ADDED = {"ego+obj+seg2": "////", "ego+obj+depth2": "\\\\\\\\", "ego+obj+seg2+depth2": "xxxx"}
-_OTHERS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
-_CONFIG_HATCHES = ("", "......", "++++", "||||")  # for several configs of one stack
-_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "p")
 _TEXT, _FAINT = "#1b1f24", "#6b7480"
 
 _TITLES = dict(zip(SCENES, ("Straight Road", "S-Turn", "H-Shaped Pathways", "Three-Way Junction")))
@@ -65,21 +48,32 @@ class Look(NamedTuple):
         return {"color": self.colour, "marker": self.marker, "linestyle": dashes, "markersize": 3.5}
 
 
-def looks(names: Sequence[str]) -> dict[str, Look]:
-    """Returns how the series of a figure are drawn; a series is "ego", or "ego, x" for a config."""
-    parts = [name.partition(", ")[::2] for name in names]
-    stacks, configs = ([*dict.fromkeys(part)] for part in zip(*parts))
-    # The paper's stacks look the same in all figures. If there is another stack, colours are
-    # assigned in turn, so that no two stacks look alike.
-    are_known = {*stacks} <= {*_COLOURS}
-    colours = _COLOURS if are_known else dict(zip(stacks, cycle(_OTHERS)))
-    by_name = {}
-    for name, (stack, config) in zip(names, parts):
-        turn = [*colours].index(stack)
-        number = configs.index(config) + (0 if are_known else turn // len(_OTHERS))
-        hatch = _CONFIG_HATCHES[number % len(_CONFIG_HATCHES)] or _ADDED.get(stack, "")
-        by_name[name] = Look(colours[stack], hatch, _MARKERS[turn % len(_MARKERS)])
-    return by_name
+# Okabe and Ito's colours for single maps and for ego + object flow. Flows with another map have a
+# darker colour of that map's hue, and a hatch or a dashed line.
+_LOOKS = {
+    "ego": Look("#e69f00", "", "o"),
+    "raw": Look("#56b4e9", "", "s"),
+    "obj": Look("#009e73", "", "^"),
+    "ego+obj": Look("#0072b2", "", "D"),
+    "seg2": Look("#d55e00", "", "v"),
+    "depth2": Look("#cc79a7", "", "P"),
+    "ego+obj+seg2": Look("#8a3c00", "////", "X"),
+    "ego+obj+depth2": Look("#7d3f66", "\\\\\\\\", "*"),
+    "ego+obj+seg2+depth2": Look("#4a4a4a", "xxxx", "p"),
+}
+
+
+def looks(stacks: Sequence[str]) -> dict[str, Look]:
+    """Returns how the stacks of a figure are drawn: the paper's look the same in all figures."""
+    if {*stacks} <= {*_LOOKS}:
+        return {stack: _LOOKS[stack] for stack in stacks}
+    # Another stack must look like none of the paper's, so all are drawn in turn.
+    colours = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
+    hatches = ("", "......", "++++", "||||")
+    turns = cycle(product(hatches, colours)), cycle(look.marker for look in _LOOKS.values())
+    return {
+        stack: Look(colour, hatch, marker) for stack, (hatch, colour), marker in zip(stacks, *turns)
+    }
 
 
 def words(name: str) -> str:

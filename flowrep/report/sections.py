@@ -13,10 +13,8 @@ from flowrep.files import refuse_link, replace_bytes, replace_text
 from flowrep.report.figures import draw_bars, draw_curves, draw_rates, encoded, words
 from flowrep.report.runs import (
     COMPLEMENTARY_STACKS,
-    DRAWN_BASELINES,
     FLOW_STACKS,
     SPEEDS,
-    STACKS,
     Condition,
     Group,
     Run,
@@ -40,7 +38,6 @@ INTERVALS = (
     "Wilson's interval over the episodes"
 )
 _MOST_PAIRS = 15  # in a table
-_LONGEST_LABEL = 30  # of a config, in a legend
 _ALL = "ego+obj+seg2+depth2"
 
 # The paper's comparisons: name, title, stacks, and differences (first, second).
@@ -91,12 +88,12 @@ def assemble(runs: Sequence[Run], warnings: Sequence[str], policy: str = "greedy
         for section in _group_sections(group, policy):
             sections.append(section._replace(folder=prefix + section.name, label=group.label))
     if len(groups) > 1:
-        sections.append(_configs_section(groups, policy)._replace(folder="configs"))
+        sections.append(_configs_section(groups)._replace(folder="configs"))
     return Report(tuple(runs), (*warnings, *unused), tuple(sections))
 
 
 def write_files(report: Report, folder: Path) -> list[Path]:
-    """Writes figures as PNG and PDF, tables as LaTeX and CSV; returns the sections' folders."""
+    """Writes figures as PNG and PDF, tables as CSV; returns the sections' folders."""
     folders = [folder / section.folder for section in report.sections]
     for section, path in zip(report.sections, folders):
         refuse_link(path).mkdir(exist_ok=True)
@@ -104,7 +101,6 @@ def write_files(report: Report, folder: Path) -> list[Path]:
             for kind in ("png", "pdf"):
                 replace_bytes(path / f"{section.name}.{kind}", encoded(section.figure, kind))
         for table in section.tables:
-            replace_text(path / f"{table.name}.tex", table.to_latex())
             replace_text(path / f"{table.name}.csv", table.to_csv())
     return folders
 
@@ -165,11 +161,10 @@ def _success_section(
     series: Mapping[str, Sequence[Run]],
     pairs: Sequence[tuple[str, str]],
     policy: str,
-    baselines: Sequence[str] = DRAWN_BASELINES,
 ) -> ReportSection:
     runs = [run for members in series.values() for run in members]
     conditions, scenes = _conditions_by_speed(runs, policy), scenes_of(runs)
-    grids = [grid_of(scene, series, conditions, baselines) for scene in scenes]
+    grids = [grid_of(scene, series, conditions) for scene in scenes]
     trained = listed(sorted({run.speed for run in runs}))
     caption = (
         f"Success of agents trained at {trained} speed, {policy} actions, {runs[0].fps:g} frames "
@@ -340,28 +335,11 @@ def _curves(runs: Sequence[Run]) -> list[ReportSection]:
     return [ReportSection("learning_curves", "Learning curves", (), draw_curves(panels), caption)]
 
 
-def _configs_section(groups: Sequence[Group], policy: str) -> ReportSection:
-    # Stacks with runs of several configs are shown side by side and never pooled.
+def _configs_section(groups: Sequence[Group]) -> ReportSection:
     keys = dict.fromkeys(key for group in groups for key in group.differences)
-    labels = [group.label for group in groups]
-    are_short = all(0 < len(label) <= _LONGEST_LABEL for label in labels)
-    configs = labels if are_short else [f"config {n}" for n in range(1, len(groups) + 1)]
     rows = [(key, *(group.differences.get(key, "")[:60] for group in groups)) for key in keys]
+    configs = [f"config {number}" for number in range(1, len(groups) + 1)]
     caption = "Config keys in which the runs differ. No number combines runs of two columns."
     columns = tuple(range(1, len(groups) + 1))
     table = Table("configs", caption, ("key", *configs), (("", tuple(rows)),), columns)
-
-    series: dict[tuple[str, str], list[Run]] = {}  # of a stack and a config
-    usable = [[run for run in g.runs if _why_unused(run, policy) is None] for g in groups]
-    in_configs = Counter(key for runs in usable for key in {(r.scene, r.stack) for r in runs})
-    shared = [key for key, number in in_configs.items() if number > 1]
-    for stack in in_order([stack for _, stack in shared], STACKS):
-        for config, runs in zip(configs, usable):
-            here = [r for r in runs if r.stack == stack and (r.scene, stack) in shared]
-            series |= {(stack, config): here} if here else {}
-    if not series:
-        return ReportSection("configs", "Configs that differ", (table,))
-    named = {", ".join(key): runs for key, runs in series.items()}
-    pairs = [(", ".join(b), ", ".join(a)) for a, b in combinations(series, 2) if a[0] == b[0]]
-    section = _success_section("configs", "Configs that differ", named, pairs, policy, ())
-    return section._replace(tables=(table, *section.tables))
+    return ReportSection("configs", "Configs that differ", (table,))

@@ -1,4 +1,4 @@
-"""Tables as LaTeX (booktabs) and CSV, and numbers as text."""
+"""Tables of a report, and numbers as text."""
 
 import csv
 import io
@@ -10,11 +10,6 @@ import numpy as np
 from flowrep.report.statistics import Estimate
 
 MISSING = "missing"
-_LATEX: dict[str, str] = {character: rf"\{character}" for character in "&%$#_{}"} | {
-    "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
-    "–": "--", "−": "$-$", "×": r"$\times$", "→": r"$\to$", "∞": r"$\infty$", "≥": r"$\ge$",
-    "<": "$<$", ">": "$>$",
-}  # fmt: skip
 
 
 class Table(NamedTuple):
@@ -31,28 +26,6 @@ class Table(NamedTuple):
         """A letter for each column, "l" or "r"."""
         return "".join("l" if i in (0, *self.words) else "r" for i in range(len(self.header)))
 
-    def to_latex(self) -> str:
-        """Returns a table environment for booktabs."""
-        lines = [_latex_row(self.header)]
-        for heading, rows in self.blocks:
-            lines.append(r"\midrule")
-            if heading:
-                span = rf"\multicolumn{{{len(self.header)}}}{{l}}"
-                lines.append(rf"{span}{{\textit{{{latex_text(heading)}}}}} \\")
-            lines += map(_latex_row, rows)
-        body = "\n    ".join(lines)
-        return rf"""\begin{{table}}[t]
-  \centering
-  \caption{{{latex_text(self.caption)}}}
-  \label{{tab:{self.name}}}
-  \begin{{tabular}}{{{self.alignment}}}
-    \toprule
-    {body}
-    \bottomrule
-  \end{{tabular}}
-\end{{table}}
-"""
-
     def to_csv(self) -> str:
         """Returns a CSV table; a block's heading is its rows' first cell."""
         text = io.StringIO(newline="")
@@ -61,15 +34,6 @@ class Table(NamedTuple):
         for heading, rows in (("group", (self.header,)), *self.blocks):
             writer.writerows((heading, *row)[first:] for row in rows)
         return text.getvalue()
-
-
-def latex_text(text: str) -> str:
-    """Returns text with LaTeX's special characters escaped."""
-    return "".join(_LATEX.get(character, character) for character in text)
-
-
-def _latex_row(row: Sequence[str]) -> str:
-    return " & ".join(latex_text(cell) for cell in row) + r" \\"
 
 
 def percent(estimate: Estimate, digits: int = 0) -> str:

@@ -275,7 +275,7 @@ FOLDERS = [
     # none, or none yet
     ("run=[a,b]", ["a", "b"]),
     ("input=0", 0),  # a camera's number
-    ("trajectories=2", 2),
+    ("num_envs=2", 2),
     ("resume=null", None),
 ]
 
@@ -291,8 +291,8 @@ def test_a_folder_is_taken_as_it_was_typed_and_nothing_else_is(tmp_path, monkeyp
 def test_folders_without_a_key_are_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "it's").mkdir()
-    typed = cli.as_typed(["it's", "videos=1", "b c"], SCHEMAS["report"])
-    assert read(shlex.join(["report", *typed])) == {"run": ["it's", "b c"], "videos": 1}
+    typed = cli.as_typed(["it's", "policy=sampled", "b c"], SCHEMAS["report"])
+    assert read(shlex.join(["report", *typed])) == {"run": ["it's", "b c"], "policy": "sampled"}
 
 
 # Names of folders.

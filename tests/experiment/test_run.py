@@ -3,7 +3,6 @@
 import copy
 import json
 import multiprocessing
-import pickle
 import sys
 import time
 from datetime import UTC, datetime
@@ -24,7 +23,6 @@ from flowrep.experiment.run import (
     check_origin,
     machine_of,
     origin_of,
-    read_drives,
 )
 from flowrep.files import TableError, write_rows
 from tests.config.composing import composed, plain
@@ -300,46 +298,3 @@ def test_a_table_from_before_a_column_is_read_with_empty_cells_and_goes_on(tmp_p
     assert run.read_episodes() == [cells(episode(1), scene_id="", path="")]
     run.log_episodes([episode(2, path="left")])
     assert [row["path"] for row in run.read_episodes()] == ["", "left"]
-
-
-# Drives are pictures' data; what they cost must not be the episodes.
-
-
-def drives(run):
-    saved = read_drives(run.drives_path).items()
-    return {drive.episode_seed: (outcome, points.tolist()) for drive, (outcome, points) in saved}
-
-
-def test_damaged_drives_cost_no_episode_and_stay_as_they_are(tmp_path):
-    run = RunFolder(tmp_path)
-    run.log_episodes([episode(1)], drives=True)
-    whole = run.drives_path.read_bytes()
-    flipped = whole[:80] + bytes([whole[80] ^ 16]) + whole[81:]
-    for damaged in (b"", b"something else", whole[:-40], pickle.dumps({"a": 1}), flipped):
-        run.drives_path.write_bytes(damaged)
-        with pytest.raises(TableError, match=r"drives\.npz.*remove it"):
-            run.log_episodes([episode(2)], drives=True)
-        assert run.drives_path.read_bytes() == damaged
-    assert [row["episode_seed"] for row in run.read_episodes()] == ["1", "2"]
-
-
-def test_whole_drives_are_added_to(tmp_path):
-    run = RunFolder(tmp_path)
-    run.log_episodes([episode(1)], drives=True)
-    again = [episode(2, positions=2 * ROAD), episode(1, positions=3 * ROAD, outcome="timeout")]
-    run.log_episodes(again, drives=True)
-    driven = {1: ("timeout", (3 * ROAD).tolist()), 2: ("collision", (2 * ROAD).tolist())}
-    assert drives(run) == driven
-    with np.load(run.drives_path) as saved:  # once, though it ended differently, as elsewhere
-        assert len(saved["outcome"]) == 2
-
-
-def test_episodes_are_saved_before_their_drives(tmp_path, monkeypatch):
-    def full(*_, **__):
-        raise OSError(28, "No space left on device")
-
-    run = RunFolder(tmp_path)
-    monkeypatch.setattr(np, "savez_compressed", full)
-    with pytest.raises(OSError, match=r"drives\.npz"):
-        run.log_episodes([episode(1)], drives=True)
-    assert len(run.read_episodes()) == 1

@@ -1,25 +1,18 @@
-"""A whole report: the command, its page in a browser, and the drives and films that it shows."""
+"""A whole report: the command, its page and its files."""
 
 import os
 import re
-import shlex
 import sys
 from itertools import product
 
-import numpy as np
 import pytest
-import yaml
 
 pytest.importorskip("scipy", reason="reports are an extra")
 pytest.importorskip("jinja2", reason="reports are an extra")
 
-from flowrep.config import CONF_DIR
-from flowrep.config.cli import value_of
-from flowrep.experiment.run import DRIVES
 from flowrep.report.__main__ import ReportConfig, main, report
 from flowrep.report.figures import draw_bars, encoded
-from flowrep.report.page import plans_and_films_of, tracks_of
-from flowrep.report.runs import Condition, grid_of, read_run, read_runs
+from flowrep.report.runs import Condition, grid_of, read_run
 from tests.report.folders import config_of, letters, rows_of, run_in, write_run
 
 
@@ -45,8 +38,7 @@ def sweep(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def page(sweep):
-    numbers = {"trajectories": 1, "videos": 1}
-    return report(ReportConfig(run=[str(sweep)], output=None, policy="greedy", **numbers))
+    return report(ReportConfig(run=[str(sweep)], output=None, policy="greedy"))
 
 
 @pytest.mark.slow
@@ -57,8 +49,7 @@ def test_each_experiment_has_its_figure_and_tables_in_every_form(page):
     drawn = {f"{name}/{name}.{kind}" for name in names for kind in ("png", "pdf")}
     tables = {f"{name}/{name}_success" for name in names[:3]} | {"failure_causes/failure_causes"}
     tables |= {f"{name}/{name}_differences" for name in names[:2]}
-    written = {f"{name}.{kind}" for name in tables for kind in ("tex", "csv")}
-    assert found == drawn | written | {"index.html"}
+    assert found == drawn | {f"{name}.csv" for name in tables} | {"index.html"}
 
 
 @pytest.mark.slow
@@ -66,7 +57,6 @@ def test_the_page_holds_all_it_shows_and_says_what_is_missing_and_wrong(page):
     text = page.read_text(encoding="utf-8")
     assert '<td class="missing">missing</td>' in text
     assert "damaged/config.yaml" in text
-    assert text.count(DRIVES) == 7  # a warning for one agent of each stack and scene
     (heading,) = re.findall(r"<h1>(.*)</h1>", text)
     assert "Straight Road" in heading
     assert "S-Turn" in heading
@@ -115,9 +105,6 @@ def test_what_was_found_is_printed_and_where_it_was_written(tmp_path, monkeypatc
     assert (tmp_path / "out" / "index.html").is_file()
 
 
-# Drives and films.
-
-
 def test_a_link_in_a_runs_folder_leads_a_report_nowhere(tmp_path, victim, monkeypatch):
     run, before = run_in(tmp_path, "run"), victim.read_text()
     (run / "report").mkdir()
@@ -132,100 +119,3 @@ def test_a_link_in_a_runs_folder_leads_a_report_nowhere(tmp_path, victim, monkey
         main()
     assert ended.value.code == 2
     assert (victim.read_text(), os.listdir(victim.parent)) == (before, ["victim"])
-
-
-def write_drives(folder, **changes):
-    """Three episodes of 2, 3 and 1 positions: the last is the first by its seed."""
-    saved = {
-        "positions": np.arange(12, dtype=np.float32).reshape(6, 2),
-        "starts": np.array([0, 2, 5, 6]),
-        "scene_id": np.array([""] * 3),  # as in the table
-        "evaluation": np.array(["final"] * 3),
-        "policy": np.array(["greedy"] * 3),
-        "speed": np.array(["normal"] * 3),
-        "fps": np.full(3, 12.0),
-        "frames": np.full(3, 1000),
-        "episode_seed": np.array([101, 102, 100]),
-        "outcome": np.array(["success", "collision", "out_of_bounds"]),
-    }
-    np.savez(folder / DRIVES, **saved | changes)
-
-
-def test_tracks_are_those_of_the_first_episodes(tmp_path):
-    write_drives(run_in(tmp_path, "run", "sco"))
-    first, second = tracks_of(read_run(tmp_path / "run"), 2)
-    assert (first.outcome, second.outcome) == ("out_of_bounds", "success")
-    np.testing.assert_array_equal(first.points_m, [[10, 11]])
-    np.testing.assert_array_equal(second.points_m, [[0, 1], [2, 3]])
-
-
-def test_only_greedy_drives_of_the_finished_agent_as_it_was_trained_are_drawn(tmp_path):
-    run = run_in(tmp_path, "run", "sco")
-    others = {"evaluation": "training", "policy": "sampled", "speed": "low", "fps": 6, "frames": 5}
-    others["scene_id"] = "1a2b3c4d"  # it may be evaluated in another scene, too
-    for key, value in others.items():
-        write_drives(run, **{key: np.full(3, value)})
-        assert tracks_of(read_run(run), 2) == [], key
-
-
-@pytest.mark.parametrize("content", [None, b"", b"PK\x03\x04 damaged"])
-def test_a_run_without_drives_or_films_is_a_line(tmp_path, content):
-    run = run_in(tmp_path, "a run, mine", "sco")
-    if content is not None:
-        (run / DRIVES).write_bytes(content)
-    drives = plans_and_films_of([read_run(run)], trajectories=2, videos=1)
-    assert (drives.plans, drives.films) == ({}, {})
-    assert ["plan" in line for line in drives.warnings] == [True, False]
-    *_, where, what = shlex.split(drives.warnings[1])  # as a shell reads the remedy
-    assert (value_of(where), what) == (str(run), "video=1")
-
-
-def test_a_plan_and_films_of_one_agent_of_each_stack(tmp_path):
-    scene = yaml.safe_load((CONF_DIR / "scene" / "straight_road.yaml").read_text())
-    for seed in (1, 0):
-        config = config_of(seed=seed) | {"scene": scene}
-        folder = write_run(tmp_path / f"run{seed}", config, rows_of(config, "sco"))
-        write_drives(folder)
-        (folder / "videos").mkdir()
-        for name in ("a", "b"):
-            (folder / "videos" / f"{name}.mp4").write_bytes(b"film")
-    runs, _ = read_runs([tmp_path])
-    drives = plans_and_films_of(runs, trajectories=3, videos=1)
-    ((place, (plan,)),) = drives.plans.items()
-    assert (place, plan.title) == ("Straight Road", "ego+obj, seed 0 (run0)")
-    assert plan.caption == "drives: 1 out of bounds, 1 success, 1 collision"
-    assert plan.data.startswith("data:image/png;base64,")
-    ((episode, (film,)),) = drives.films.items()
-    assert (episode, film.data) == ("Straight Road, A", "data:video/mp4;base64,ZmlsbQ==")
-    assert drives.warnings == []
-
-
-def test_a_run_whose_scene_is_unknown_is_a_line_and_the_others_have_their_plan(tmp_path):
-    scene = yaml.safe_load((CONF_DIR / "scene" / "straight_road.yaml").read_text())
-    for stack, changes in (("raw", {}), ("ego", {"paths": "nowhere"})):
-        config = config_of(stack=stack) | {"scene": scene | changes}
-        write_drives(write_run(tmp_path / stack, config, rows_of(config, "sco")))
-    runs, _ = read_runs([tmp_path])
-    drives = plans_and_films_of(runs, trajectories=1, videos=0)
-    assert [plan.title.split(",")[0] for plan in drives.plans["Straight Road"]] == ["raw"]
-    (warning,) = drives.warnings
-    assert str(tmp_path / "ego") in warning
-    assert "paths" in warning
-
-
-@pytest.mark.parametrize("linked", ["film", "folder"])
-def test_a_film_that_lies_outside_of_the_run_is_not_embedded(tmp_path, linked):
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "elsewhere" / "a.mp4").write_bytes(b"secret")
-    run = run_in(tmp_path, "run", "sco")
-    if linked == "folder":
-        (run / "videos").symlink_to(tmp_path / "elsewhere")
-    else:
-        (run / "videos").mkdir()
-        (run / "videos" / "a.mp4").symlink_to(tmp_path / "elsewhere" / "a.mp4")
-    drives = plans_and_films_of([read_run(run)], trajectories=0, videos=1)
-    assert drives.films == {}
-    (warning,) = drives.warnings
-    # the remedy is one that the command takes
-    command, _, value = warning.rpartition(" ")[2].partition("=")
-    assert (command, value) == ("video", "1")
