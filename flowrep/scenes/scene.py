@@ -7,7 +7,7 @@ refuses. After that these are plain dataclasses of floats and ints.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,6 +96,9 @@ Whole = Annotated[int, Strict(), Field(ge=0)]
 Name = Annotated[str, StringConstraints(min_length=1)]
 FileName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 Point = tuple[Position, Position]
+_Part = TypeVar("_Part")
+MOST_PARTS = 1_000  # of a kind: as many take a second to check
+Parts = Annotated[tuple[_Part, ...], Field(max_length=MOST_PARTS)]
 Size3 = tuple[Length, Length, Length]
 SpeedRange = Annotated[tuple[NotNegative, NotNegative], AfterValidator(_in_order)]
 HouseRange = Annotated[tuple[HouseSide, HouseSide], AfterValidator(_in_order)]
@@ -209,7 +212,7 @@ class Road(Part):
     """Width of the drivable ground."""
     sidewalk_m: LengthOrZero
     """Width of each sidewalk; 0 for none."""
-    pieces: Annotated[tuple[Piece, ...], Field(min_length=1)]
+    pieces: Annotated[Parts[Piece], Field(min_length=1)]
 
 
 @dataclass(frozen=True)
@@ -241,7 +244,7 @@ class Path(Part):
     """The zone in which it starts."""
     end: Name
     """The zone that has to be reached."""
-    closures: tuple[Name, ...] = ()
+    closures: Parts[Name] = ()
     """The closures that are present in its episodes."""
 
 
@@ -284,7 +287,7 @@ class Walk(Part):
     """The other end."""
     offset_m: Position = 0.0
     """Distance of a walk along a road to the left of its centreline."""
-    points_m: tuple[Point, ...] = ()
+    points_m: Parts[Point] = ()
     """The points [x, y] that a walk connects."""
 
     def __post_init__(self) -> None:
@@ -417,9 +420,9 @@ class Scene(Part):
     time_limit_steps: Count
     """The longest episode in steps; at another frame rate, the limit in seconds stays the same."""
     categories: Annotated[
-        tuple[Name, ...],
+        Parts[Name],
         AfterValidator(_named_once),
-        BeforeValidator(_all_or_named, json_schema_input_type=tuple[Name, ...] | Literal["all"]),
+        BeforeValidator(_all_or_named, json_schema_input_type=Parts[Name] | Literal["all"]),
     ]
     """The classes that the semantic map may show, whose ids are in `flowrep.scenes.CATEGORY_ID`; an
     agent that reads them can drive wherever there are no others. `all` stands for those of all
@@ -428,17 +431,17 @@ class Scene(Part):
     """Seed of the houses' sizes and fronts, which are drawn once for the scene."""
     camera: CameraConfig
     vehicle: VehicleConfig
-    roads: Annotated[tuple[Road, ...], Field(min_length=1), AfterValidator(_named_once)]
-    zones: Annotated[tuple[Zone, ...], Field(min_length=1), AfterValidator(_named_once)]
-    paths: Annotated[tuple[Path, ...], Field(min_length=1), AfterValidator(_named_once)]
+    roads: Annotated[Parts[Road], Field(min_length=1), AfterValidator(_named_once)]
+    zones: Annotated[Parts[Zone], Field(min_length=1), AfterValidator(_named_once)]
+    paths: Annotated[Parts[Path], Field(min_length=1), AfterValidator(_named_once)]
     pedestrian_speed_mps: Annotated[dict[SpeedMode, SpeedRange], AfterValidator(_all_modes)]
     """[lowest, highest] speed of people in each of the modes low, normal and high."""
-    pedestrian_groups: Annotated[tuple[PedestrianGroup, ...], AfterValidator(_named_once)] = ()
-    building_rows: tuple[BuildingRow, ...] = ()
+    pedestrian_groups: Annotated[Parts[PedestrianGroup], AfterValidator(_named_once)] = ()
+    building_rows: Parts[BuildingRow] = ()
     obstacles: tuple[Obstacle, ...] = ()
-    obstacle_rows: tuple[ObstacleRow, ...] = ()
-    closures: Annotated[tuple[Closure, ...], AfterValidator(_named_once)] = ()
-    crosswalks: tuple[Crosswalk, ...] = ()
+    obstacle_rows: Parts[ObstacleRow] = ()
+    closures: Annotated[Parts[Closure], AfterValidator(_named_once)] = ()
+    crosswalks: Parts[Crosswalk] = ()
     terrain_m: LengthOrZero = 0.0
     """How far grass extends beyond the roads' bounding box, which it fills; 0 for none."""
     corner_radius_m: LengthOrZero = 0.0

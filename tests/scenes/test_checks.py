@@ -52,6 +52,8 @@ def refusal(data, changes):
         ({"name": "../../up"}, "name"),
         ({"roads.0.start_m": [1.0]}, "roads[0].start_m[1]"),
         ({"paths": []}, "paths"),
+        ({"roads.0.pieces": [{"straight_m": 0.01}] * 1_001}, "roads[0].pieces"),
+        ({"zones": [ON_STEM | {"name": str(i)} for i in range(20_000)]}, "zones"),
         ({"pedestrian_groups.0.speed_mps": [2, 1]}, "pedestrian_groups[0].speed_mps"),
         ({"pedestrian_speed_mps.low": MISSING}, "pedestrian_speed_mps"),
         # Parts that don't agree with themselves.
