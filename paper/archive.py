@@ -37,6 +37,7 @@ from flowrep.report.runs import (
 )
 
 _MACHINE = ("commit", "precision", "cpu")
+MOST_BYTES = 1 << 30  # of the tables, which are read into memory
 RUNS, EPISODES, TRAINING = "runs.jsonl", "episodes.csv", "training.csv"
 
 
@@ -51,6 +52,8 @@ def read_archive(path: Path) -> list[Run]:
     """Returns the runs of one study."""
     runs = []
     with ZipFile(path) as archive:
+        if (size := sum(part.file_size for part in archive.infolist())) > MOST_BYTES:
+            raise RunFolderError(f"'{path}' unpacks to {size:,} bytes, more than {MOST_BYTES:,}")
         episodes, training = (_cells_of_runs(archive, name) for name in (EPISODES, TRAINING))
         for line in archive.read(RUNS).decode("utf-8").splitlines():
             entry = json.loads(line)

@@ -9,6 +9,7 @@ pytest.importorskip("scipy", reason="reports are an extra")
 
 from flowrep.experiment.run import RunFolderError
 from flowrep.report.runs import read_run, read_runs
+from paper import archive
 from paper.archive import read_archive, read_archives, write_archive
 from tests.report.folders import config_of, rows_of, run_in, write_run
 
@@ -55,3 +56,10 @@ def test_two_runs_of_one_name_are_refused_in_a_study_and_in_two(tmp_path):
         write_archive([run], tmp_path / "packed" / name)
     with pytest.raises(RunFolderError, match="two runs are named s0"):
         read_archives(tmp_path / "packed")
+
+
+def test_a_study_that_would_fill_the_memory_is_refused(tmp_path, monkeypatch):
+    write_archive([read_run(run_in(tmp_path, "a"))], tmp_path / "study.zip")
+    monkeypatch.setattr(archive, "MOST_BYTES", 1_000)
+    with pytest.raises(RunFolderError, match=r"study\.zip.* bytes"):
+        read_archive(tmp_path / "study.zip")
