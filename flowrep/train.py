@@ -125,7 +125,7 @@ def announce(config: TrainConfig, settings: str) -> None:
 
     from flowrep.envs.workers import available_cores
     from flowrep.experiment import build
-    from flowrep.experiment.run import cpu_name
+    from flowrep.experiment.provenance import cpu_name
 
     device = build.device(config.device)
     where = torch.cuda.get_device_name(device) if device.type == "cuda" else cpu_name()

@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, get_args
 from flowrep.config.cli import composed
 from flowrep.config.options import BaselineName, validated
 from flowrep.config.usage import UsageError, closest_first
-from flowrep.experiment.run import RunFolder, check_origin, origin_of
+from flowrep.experiment.provenance import check_origin, origin_of
+from flowrep.experiment.run import RunFolder
 from flowrep.experiment.schema import EnvConfig, Machine, TrainConfig, validated_run
 from flowrep.scenes import Scene, load_scene
 

@@ -7,12 +7,6 @@ that need it import it.
 from __future__ import annotations
 
 import json
-import os
-import platform
-import re
-import shutil
-import subprocess
-import uuid
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -25,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 import yaml
 from filelock import FileLock, Timeout
 
-from flowrep import __version__
 from flowrep.config.usage import UsageError
 from flowrep.config.yaml_file import read_yaml
 from flowrep.experiment.outcomes import (
@@ -36,7 +29,6 @@ from flowrep.experiment.outcomes import (
     read_episodes,
 )
 from flowrep.experiment.schema import TrainConfig, validated_run
-from flowrep.extras import require
 from flowrep.files import (
     append_rows,
     naming,
@@ -48,7 +40,6 @@ from flowrep.files import (
 )
 
 if TYPE_CHECKING:
-    import torch
     from torchrl.record.loggers import TensorboardLogger
 
 
@@ -62,143 +53,6 @@ class FolderInUseError(OSError):
 
 _TIMES = ("started", "ended")
 
-_IDENTITY = (
-    "scene", "representations", "flow", "motion", "noise", "algorithm", "speed", "seed", "num_envs",
-)  # fmt: skip
-"""The parts of a config that determine the weights after some number of frames."""
-
-
-def origin_of(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the identity of a run: flowrep's version, and the config keys that define it."""
-    # Tuples become lists, as they are in a checkpoint that was read.
-    parts = json.loads(json.dumps({key: config[key] for key in _IDENTITY}))
-    # It only selects `algorithm.mirror` in presets; the street is the same with and without it.
-    parts["scene"].pop("symmetric", None)
-    return {"flowrep": __version__, **parts}
-
-
-def check_origin(saved: Mapping[str, Any], expected: Mapping[str, Any], path: Path) -> None:
-    """Checks that a checkpoint belongs to a run; the error names the first difference."""
-    from flowrep.agent import CheckpointError
-
-    if saved.get("flowrep") != expected["flowrep"]:
-        raise CheckpointError(
-            f"{path} was written by flowrep {saved.get('flowrep')}, this is {expected['flowrep']}: "
-            "install that version, or start a new run"
-        )
-    there, here = flattened(saved), flattened(expected)
-    for key in {**there, **here}:
-        was, now = there.get(key, "absent"), here.get(key, "absent")
-        if was != now:
-            raise CheckpointError(
-                f"{path} belongs to a run with {key}={was}, the config.yaml of its folder says "
-                f"{key}={now}: restore the file that was there, or start a new run"
-            )
-
-
-def flattened(config: Mapping[str, Any], section: str = "") -> dict[str, Any]:
-    """Returns nested values by their dotted keys; an empty mapping is a value."""
-    flat: dict[str, Any] = {}
-    for key, value in config.items():
-        nested = flattened(value, f"{section}{key}.") if isinstance(value, Mapping) else {}
-        flat |= nested or {f"{section}{key}": value}
-    return flat
-
-
-def machine_of(precision: torch.dtype) -> dict[str, Any]:
-    """Returns versions, commit, processor and number format, which may change a run's numbers."""
-    import torch
-
-    home, commit = Path(__file__).parents[2], None
-    if (home / ".git").exists() and shutil.which("git"):
-        ask = ["git", "-C", str(home), "describe", "--always", "--dirty", "--abbrev=40"]
-        # Without tags, which would take the place of the hash.
-        answer = subprocess.run([*ask, "--exclude=*"], capture_output=True, text=True)
-        commit = answer.stdout.strip() or None
-    return {
-        "flowrep": __version__,
-        "commit": commit,
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-        "precision": str(precision).removeprefix("torch."),
-        "cpu": cpu_name(),
-        "cores": os.cpu_count(),
-        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
-    }
-
-
-def cpu_name() -> str:
-    """Returns the processor's name."""
-    info = Path("/proc/cpuinfo")  # of Linux, where platform.processor() is empty
-    lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return next(iter(names), platform.processor() or platform.machine())
-
-
-class Loggers:
-    """Logs to TensorBoard in a run's folder and, after `add_wandb`, to Weights & Biases."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._tensorboard: TensorboardLogger | None = None
-        self._wandb: Any = None
-
-    def log(self, frames: int, values: Mapping[str, float]) -> None:
-        """Logs values by title."""
-        with naming(self._folder / "tensorboard"):
-            if self._tensorboard is None:
-                # Imports PyTorch, before which commands open their folders.
-                from torchrl.record.loggers import TensorboardLogger
-
-                self._tensorboard = TensorboardLogger("tensorboard", str(self._folder))
-            for logger in filter(None, (self._tensorboard, self._wandb)):
-                logger.log_metrics(dict(values), frames)
-
-    def log_episodes(self, records: Sequence[EpisodeRecord]) -> None:
-        """Logs shares of outcomes, mean return and mean length, by scene, condition and policy."""
-        values: dict[str, list[float]] = defaultdict(list)
-        for each in records:
-            # "training" would be taken for the episodes from which the agent learns.
-            kind = each.evaluation.replace("training", "evaluation")
-            title = "/".join((kind, each.scene, each.speed, f"{each.fps:g}fps", each.policy))
-            for name in OUTCOMES:
-                values[f"{title}/{name}"].append(each.outcome == name)
-            values[f"{title}/return"].append(each.return_)
-            values[f"{title}/length"].append(each.length)
-        self.log(records[0].frames, {title: fmean(all_) for title, all_ in values.items()})
-
-    def flush(self) -> None:
-        """Writes what TensorBoard's writer still holds."""
-        if self._tensorboard is not None:
-            self._tensorboard.experiment.flush()
-
-    def add_wandb(self, mode: str, config: Mapping[str, Any]) -> None:
-        """Sends everything logged from now on to Weights & Biases too, unless `mode` is "off".
-
-        A resumed run continues its wandb run, whose id is in the folder.
-        """
-        if mode == "off":
-            return
-        require(f"wandb={mode}", "train,wandb", "wandb")
-        kept = self._folder / "wandb_id"
-        if not kept.is_file():
-            replace_text(kept, uuid.uuid4().hex[:12])
-        name = kept.read_text(encoding="utf-8")
-        if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name):  # it becomes a part of paths
-            raise UsageError(f"{kept} does not hold a wandb run's id: restore or remove it")
-
-        from torchrl.record.loggers.wandb import WandbLogger
-
-        self._wandb = WandbLogger(
-            self._folder.name,
-            project="flowrep",
-            save_dir=str(self._folder),
-            id=name,
-            mode=mode,
-            config=dict(config),
-            log_env_packages=False,
-        )
-
 
 class RunFolder:
     """The files of one run, by name; docs/runs.md says what is in them."""
@@ -209,7 +63,7 @@ class RunFolder:
         self.metrics_path = self.path / "metrics.csv"
         self.checkpoint_path = self.path / "checkpoint" / "latest.safetensors"
         self.evaluation_path = self.path / "evaluation.csv"
-        self.loggers = Loggers(self.path)
+        self._tensorboard: TensorboardLogger | None = None
 
     @classmethod
     def existing(cls, path: str | Path) -> RunFolder:
@@ -249,8 +103,8 @@ class RunFolder:
         `patience_s` to release the folder.
         """
         self.path.mkdir(parents=True, exist_ok=True)
-        # In a stranger's folder: TensorBoard, wandb and FFmpeg would write through them.
-        for name in (".lock", "checkpoint", "tensorboard", "videos", "wandb", ".hydra"):
+        # In a stranger's folder: TensorBoard and FFmpeg would write through them.
+        for name in (".lock", "checkpoint", "tensorboard", "videos", ".hydra"):
             refuse_link(self.path / name)
         lock = FileLock(self.path / ".lock")
         try:
@@ -320,9 +174,9 @@ class RunFolder:
         replace_text(path, json.dumps([*machines, entry], indent=1) + "\n")
 
     def log_metrics(self, frames: int, metrics: Mapping[str, float]) -> None:
-        """Appends one row to metrics.csv and logs the same values to TensorBoard and wandb."""
+        """Appends one row to metrics.csv and logs the same values to TensorBoard."""
         append_rows(self.metrics_path, [{"frames": frames, **metrics}])
-        self.loggers.log(frames, metrics)
+        self._plot(frames, metrics)
 
     def forget_after(self, frames: int) -> None:
         """Drops the rows logged after `frames`; a resumed run writes them again."""
@@ -357,9 +211,33 @@ class RunFolder:
         return read_episodes(self.evaluation_path)
 
     def log_episodes(self, records: Sequence[EpisodeRecord]) -> None:
-        """Saves evaluated episodes, and logs their means to TensorBoard and wandb."""
+        """Saves evaluated episodes, and logs their means to TensorBoard, by condition."""
         self.save_episodes(records)
-        self.loggers.log_episodes(records)
+        values: dict[str, list[float]] = defaultdict(list)
+        for each in records:
+            # "training" would be taken for the episodes from which the agent learns.
+            kind = each.evaluation.replace("training", "evaluation")
+            title = "/".join((kind, each.scene, each.speed, f"{each.fps:g}fps", each.policy))
+            for name in OUTCOMES:
+                values[f"{title}/{name}"].append(each.outcome == name)
+            values[f"{title}/return"].append(each.return_)
+            values[f"{title}/length"].append(each.length)
+        self._plot(records[0].frames, {title: fmean(all_) for title, all_ in values.items()})
+
+    def _plot(self, frames: int, values: Mapping[str, float]) -> None:
+        """Logs values to TensorBoard by title."""
+        with naming(self.path / "tensorboard"):
+            if self._tensorboard is None:
+                # Imports PyTorch, before which commands open their folders.
+                from torchrl.record.loggers import TensorboardLogger
+
+                self._tensorboard = TensorboardLogger("tensorboard", str(self.path))
+            self._tensorboard.log_metrics(dict(values), frames)
+
+    def flush(self) -> None:
+        """Writes what TensorBoard's writer still holds."""
+        if self._tensorboard is not None:
+            self._tensorboard.experiment.flush()
 
     def save_episodes(self, records: Iterable[EpisodeRecord]) -> None:
         """Adds evaluated episodes to evaluation.csv, in place of earlier rows of the same episodes.

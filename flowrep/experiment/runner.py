@@ -33,7 +33,8 @@ from flowrep.experiment.evaluation import (
     PairedEvaluation,
 )
 from flowrep.experiment.outcomes import OUTCOMES, print_results
-from flowrep.experiment.run import RunFolder, check_origin, machine_of, origin_of
+from flowrep.experiment.provenance import check_origin, machine_of, origin_of
+from flowrep.experiment.run import RunFolder
 from flowrep.experiment.schema import TrainConfig
 from flowrep.progress import StopRequest, Stopwatch, progress_bar
 
@@ -80,7 +81,6 @@ class Runner:
     def train(self, stop: StopRequest) -> None:
         """Trains until `total_frames` or until a stop is requested, and saves the last state."""
         total = self.config.total_frames
-        self.folder.loggers.add_wandb(self.config.wandb, self.config.plain())
         self.folder.note_machine(self.machine)
         log = Every(self.config.log_every_frames, self.frames)
         evaluate = Every(self.config.evaluation.every_frames, self.frames)
@@ -204,11 +204,11 @@ class Runner:
             print(f"video: {path}")
 
     def close(self) -> None:
-        """Ends the envs' worker processes, and flushes the loggers."""
+        """Ends the envs' worker processes, and flushes TensorBoard."""
         if not self.env.is_closed:
             self.env.close()
         with suppress(OSError):  # only TensorBoard lacks numbers then; the tables have them
-            self.folder.loggers.flush()
+            self.folder.flush()
 
     def check(self) -> None:
         """Checks that losses and metrics are finite; the error names the last good checkpoint."""

@@ -177,7 +177,6 @@ class TrainConfig(EnvConfig):
     compiled: bool
     log_every_frames: Count
     checkpoint_every_frames: Count
-    wandb: Literal["off", "offline", "online"]
     resume: Text | None
     experiment: Text | None
     evaluation: Evaluation

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from flowrep.config.options import SpeedMode
 from flowrep.experiment.outcomes import EVALUATION_COLUMNS, EpisodeRecord
-from flowrep.experiment.run import RunFolder, RunFolderError, flattened, origin_of
+from flowrep.experiment.provenance import flattened, origin_of
+from flowrep.experiment.run import RunFolder, RunFolderError
 from flowrep.files import TableError
 from flowrep.report.statistics import Array, Estimate, mean_share
 
@@ -112,7 +113,7 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
     runs: dict[str, Run] = {}  # by path, so that a folder given twice counts once
     warnings: list[str] = []
     for folder in folders:
-        # Hydra and wandb leave copies of a run's config.yaml inside of its folder.
+        # Hydra leaves copies, as wandb did, of a run's config.yaml inside of its folder.
         paths = [config.parent for config in sorted(folder.rglob("config.yaml"))]
         paths = [p for p in paths if {".hydra", "wandb"}.isdisjoint(p.relative_to(folder).parts)]
         if not paths:

@@ -1,12 +1,9 @@
-"""A run's folder: one owner, tables that survive, a checkpoint that belongs to its config."""
+"""A run's folder: one owner, and tables that survive."""
 
-import copy
 import json
 import multiprocessing
-import sys
 import time
 from datetime import UTC, datetime
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,18 +11,11 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from flowrep.agent import CheckpointError
 from flowrep.experiment.outcomes import EVALUATION_COLUMNS, EpisodeRecord
-from flowrep.experiment.run import (
-    FolderInUseError,
-    RunFolder,
-    RunFolderError,
-    check_origin,
-    machine_of,
-    origin_of,
-)
+from flowrep.experiment.provenance import machine_of
+from flowrep.experiment.run import FolderInUseError, RunFolder, RunFolderError
 from flowrep.files import TableError, write_rows
-from tests.config.composing import composed, plain
+from tests.config.composing import composed
 
 
 def hold(run, is_held):
@@ -60,70 +50,6 @@ def test_a_run_whose_folder_is_moved_begins_no_other_one(tmp_path):
     assert not run.path.exists()
 
 
-PATH = Path("run/checkpoint/latest.safetensors")
-
-
-@pytest.fixture(scope="module")
-def config():
-    return plain("train", "debug=smoke")
-
-
-def test_the_same_run_on_another_machine_is_the_same(config):
-    here = config | {"device": "cuda", "num_workers": 7, "resume": "somewhere", "wandb": "online"}
-    check_origin(origin_of(config), origin_of(here), PATH)
-
-
-@pytest.mark.parametrize(
-    ("place", "value", "says"),
-    [
-        ("scene.camera.fov_deg", 90.0, r"scene.camera.fov_deg=60.0, the config.yaml .*=90.0"),
-        ("scene.name", "s_turn", "scene.name=straight_road, "),
-        ("representations.ego.scale", 0.3, "representations.ego.scale=.* says .*=0.3"),
-        ("representations.seg", {}, "representations.seg=absent"),
-        ("motion", "estimated", "motion=exact, .* says motion=estimated"),
-        ("noise.drift_m", 0.1, "noise.drift_m=0.0, .* says noise.drift_m=0.1"),
-    ],
-)
-def test_an_edited_config_is_refused_by_the_name_of_the_key(config, place, value, says):
-    edited = copy.deepcopy(config)
-    *path, key = place.split(".")
-    node = edited
-    for part in path:
-        node = node[part]
-    node[key] = value
-    with pytest.raises(CheckpointError, match=f"{PATH} belongs to a run with {says}"):
-        check_origin(origin_of(config), origin_of(edited), PATH)
-
-
-def test_another_version_is_refused(config):
-    with pytest.raises(CheckpointError, match=r"0\.0\.9"):
-        check_origin(origin_of(config) | {"flowrep": "0.0.9"}, origin_of(config), PATH)
-
-
-def test_without_the_package_the_extra_is_named(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "wandb", None)
-    RunFolder(tmp_path).loggers.add_wandb("off", {})
-    with pytest.raises(ImportError, match=r"wandb=offline needs .*\[train,wandb\]"):
-        RunFolder(tmp_path).loggers.add_wandb("offline", {})
-
-
-@pytest.mark.slow
-def test_offline_runs_are_kept_in_the_folder_and_go_on_under_the_same_name(tmp_path):
-    wandb = pytest.importorskip("wandb", reason="needs the extra: pip install 'flowrep-rl[wandb]'")
-    names = []
-    for frames in (10, 20):
-        run = RunFolder(tmp_path)
-        run.loggers.add_wandb("offline", {"seed": 3})
-        run.log_metrics(frames, {"alpha": 1 / frames})
-        names.append(wandb.run.id)
-        assert wandb.run.config["seed"] == 3
-        assert dict(wandb.run.summary)["alpha"] == 1 / frames
-        wandb.finish()
-    assert names == [(tmp_path / "wandb_id").read_text()] * 2
-    assert list((tmp_path / "wandb").glob(f"offline-run-*/run-{names[0]}.wandb"))
-    assert (tmp_path / "metrics.csv").read_text().splitlines()[1:] == ["10,0.1", "20,0.05"]
-
-
 def test_metrics_and_means_of_evaluations_go_to_tensorboard(tmp_path):
     """Two of four succeed; returns 1, 2, 3 and 10, lengths 10, 20, 30 and 60."""
     run = RunFolder(tmp_path)
@@ -136,7 +62,7 @@ def test_metrics_and_means_of_evaluations_go_to_tensorboard(tmp_path):
             for k, (outcome, total, length) in enumerate(ends)
         ]
     )
-    run.loggers.flush()
+    run.flush()
     events = EventAccumulator(str(next(tmp_path.rglob("events.out.tfevents.*"))))
     events.Reload()
     title = "evaluation/s_turn/normal/12fps/greedy"
@@ -217,11 +143,6 @@ def test_a_run_notes_each_machine_with_its_first_start_and_its_last_end(tmp_path
     assert times == [
         ("10:00:00+00:00", "11:00:00+00:00"), *[(f"{h}:00:00+00:00",) * 2 for h in (12, 13)]
     ]  # fmt: skip
-
-
-def test_a_clone_on_a_machine_without_git_has_no_commit(tmp_path, monkeypatch):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    assert machine_of(torch.float32)["commit"] is None
 
 
 def test_a_folder_without_a_run_is_named(tmp_path):
