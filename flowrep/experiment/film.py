@@ -1,6 +1,5 @@
 """Films of episodes."""
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
@@ -10,8 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from PIL import Image as pillow
-from PIL import ImageDraw
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Categorical, TensorSpec
@@ -21,7 +18,6 @@ from flowrep.envs import street_envs
 from flowrep.experiment.evaluation import Driver, evaluate
 from flowrep.experiment.outcomes import EpisodeRecord
 from flowrep.experiment.schema import EnvConfig
-from flowrep.scenes.vehicle import YAW_SIGN
 from flowrep.transforms import representation_stack
 from flowrep.transforms.stack import FLOWS, FRAMES_OF, REPRESENTATIONS, representation_options
 from flowrep.viz import (
@@ -34,16 +30,14 @@ from flowrep.viz import (
     stock_tiles,
     write_video,
 )
-from flowrep.viz.maps import resized, text_bar, tile_zoom
+from flowrep.viz.maps import text_bar, tile_zoom
 
 OUTCOME_S = 1.0
 """Seconds for which a film shows the outcome at its end."""
 
 _MOST_TILES = 4  # of a representation that is drawn channel by channel
 _STATUS_PX = 28
-_WHEEL_PX, _RIM_PX = 60, 6
-_WHITE, _BLACK, _YELLOW = (250, 250, 250), (20, 20, 20), (255, 210, 0)
-_ACTIONS = ("keeps its yaw rate", "turns left", "turns right")  # in the order of YAW_SIGN
+_ACTIONS = ("keeps its yaw rate", "turns left", "turns right")  # in the order of the actions
 
 Units = Callable[[Tensor], Tensor]
 
@@ -53,7 +47,6 @@ class FilmFrame(NamedTuple):
 
     maps: dict[str, Tensor]  # [C, H, W] by tile; ids, metres or px per step
     steps: int  # of the episode so far
-    turned: float  # the yaw rate over the largest one, positive to the left
     action: int | None = None  # chosen at this frame; None if unknown, as in the last frame
 
 
@@ -145,9 +138,7 @@ class Film:
 
         def keep(tensordict: TensorDictBase) -> None:
             maps = {tile: to(tensordict[key][0].cpu()) for tile, (key, to) in self._maps.items()}
-            episode, vehicle = self.street.episode, self.street.scene.vehicle
-            turned = episode.now.vehicle.yaw_rate_rps / math.radians(vehicle.max_yaw_rate_dps)
-            frames.append(FilmFrame(maps, episode.steps, turned))
+            frames.append(FilmFrame(maps, self.street.episode.steps))
             on_frame(tensordict)
 
         (episode,) = evaluate(self.env, act, [options], on_frame=keep)
@@ -155,22 +146,13 @@ class Film:
 
     def draw(self, frame: FilmFrame, ended: EpisodeRecord | None = None) -> Image:
         """Returns a frame's picture, with the outcome of the episode if it has `ended`."""
-        tiles, action = dict(self.tiles), frame.action
-        if rgb := tiles.get("rgb"):
-            sign = 0.0 if action is None else YAW_SIGN[action]
-
-            def with_wheel(picture: Tensor) -> Image:
-                enlarged = resized(rgb.draw(picture), *self._tile_size)
-                return with_steering(enlarged, frame.turned, sign)
-
-            tiles["rgb"] = rgb._replace(draw=with_wheel)
         classes = self.street.scene.categories
         drawn = representation_strip(
-            frame.maps, tiles=tiles, framed=self.framed, categories=classes
+            frame.maps, tiles=self.tiles, framed=self.framed, categories=classes
         )
         if ended is None:
             seconds = frame.steps / self.street.frame_rate_hz
-            status = f"{seconds:.1f} s   {'' if action is None else _ACTIONS[action]}"
+            status = f"{seconds:.1f} s   {'' if frame.action is None else _ACTIONS[frame.action]}"
             colour = "#ffffff"
         else:
             status, colour = how_it_ended(ended), OUTCOME_COLOURS[ended.outcome]
@@ -241,37 +223,3 @@ def _colours_of(spec: TensorSpec) -> Callable[[Any], Image]:
     low, high = float(spec.space.low.min()), float(spec.space.high.max())
     # The bounds of an unbounded spec are those of its dtype, which would leave one grey.
     return partial(grey_to_rgb, low=low, high=high) if high - low < 1e6 else grey_to_rgb
-
-
-def with_steering(image: Image, turned: float, sign: float = 0.0) -> Image:
-    """Returns an image with a steering wheel in the middle of its lower edge, if there is room.
-
-    Args:
-        turned: the yaw rate as a share of the largest, positive to the left; at 1 the wheel is
-            turned by 90° to the left.
-        sign: of the chosen action, positive to the left; 0 draws no arrow.
-    """
-    height, width = image.shape[:2]
-    top, left = height - _WHEEL_PX - 6, (width - 2 * _WHEEL_PX) // 2
-    if top < 0 or left < 0:
-        return image
-    whole, area = pillow.fromarray(image), (left, top, left + 2 * _WHEEL_PX, top + _WHEEL_PX)
-    fine = 4  # drawn larger and scaled down, because Pillow draws without antialiasing
-    x, y = fine * _WHEEL_PX, fine * _WHEEL_PX / 2
-    wheel = whole.crop(area).resize((2 * x, x))
-    draw, radius = ImageDraw.Draw(wheel), y - 2 * fine
-    for thickness, colour in ((_RIM_PX + 2, _BLACK), (_RIM_PX, _WHITE)):
-        outer = radius - fine * (_RIM_PX - thickness) / 2
-        box = (x - outer, y - outer, x + outer, y + outer)
-        draw.ellipse(box, outline=colour, width=fine * thickness)
-        for spoke_deg in (0, 180, 270):  # right, left and down; counter-clockwise is left
-            angle = math.radians(spoke_deg + 90 * turned)
-            rim = x + math.cos(angle) * radius * 0.9, y - math.sin(angle) * radius * 0.9
-            draw.line((x, y, *rim), fill=colour, width=fine * (thickness - 1))
-    if sign:
-        side = -math.copysign(1, sign)  # left is -x
-        tip, base = x + side * (radius + fine * 26), x + side * (radius + fine * 6)
-        arrow = [(tip, y), (base, y - fine * 14), (base, y + fine * 14)]
-        draw.polygon(arrow, fill=_YELLOW, outline=_BLACK, width=fine)
-    whole.paste(wheel.resize((2 * _WHEEL_PX, _WHEEL_PX), pillow.Resampling.BOX), area)
-    return np.array(whole)

@@ -44,11 +44,6 @@ def test_a_drive_has_a_frame_for_each_step_of_the_episode_that_was_asked_for(fil
     assert [frame.steps for frame in frames] == [*range(episode.length + 1)]
     # with the frame in which the episode has ended, where nothing is decided any more
     assert [frame.action for frame in frames] == [1] * episode.length + [None]
-    turned = [frame.turned for frame in frames]
-    assert turned == sorted(turned)
-    assert turned[0] == 0 < turned[1]  # to the left
-    # 35°/s² for a twelfth of a second, in shares of 60°/s
-    assert turned[1] == pytest.approx(35 / 12 / 60)
 
 
 def test_maps_that_the_agent_does_not_read_are_exact(film_of):
