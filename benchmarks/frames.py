@@ -4,7 +4,7 @@
 
 1. One view: a planner drives, and every view is drawn by both renderers, with all people in place.
 2. A frame of 32 envs in one process with ego and obj and random actions, without policy and replay
-   memory. The rasteriser draws all envs at once, PyBullet one after the other; the two take turns.
+   memory.
 3. Frames per second by number of worker processes, with `--workers 0 1 4`; 0 is this process alone.
 
 The first two are CPU times, so that other work on the machine does not count; the third is wall
@@ -14,17 +14,22 @@ time. With `--device cuda` only the third runs.
 import argparse
 import dataclasses
 import statistics
+import sys
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 import torch
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.pybullet_view import PyBulletView
 from flowrep.baselines import Planner
 from flowrep.envs import StreetEnv, make_env
-from flowrep.envs.sensing import Sensing
 from flowrep.envs.street_env import Episode
 from flowrep.envs.vector_env import StreetVectorEnv
 from flowrep.scenes import load_scene, scene_names
@@ -53,33 +58,31 @@ def timed(call: Callable[[], Any]) -> tuple[float, Any]:
 def view_times(scene: Scene, count: int) -> Iterator[dict[str, float]]:
     """Yields the ms of a step and of drawing its view, `count` times."""
     env, planner = StreetEnv(scene, sensors=SENSORS), Planner()
-    street = Street.shared(scene)
-    pictured = Sensing(street, MAPS, "pybullet", 1)
+    pictured = PyBulletView(Street.shared(scene), scene.camera)
     rasterise = env.sensing._rasteriser(1)
     env.reset(seed=0)
     for _ in range(count):
         action = planner(env)  # not counted
         step, (*_, terminated, _, _) = timed(lambda action=action: env.step(action))
-        # PyBullet draws bodies where they were last placed, and a step with the rasteriser places
-        # only those that the vehicle may hit: `observe` places all, then the picture is timed.
-        pictured.observe(env.episode)
-        poses = env.sensing.views([env.episode])
+        poses = cam_from_world, parts, is_shown = env.sensing.views([env.episode])
+        pictured.place(parts[0], is_shown[0])  # not counted
         yield {
             "step": step,
-            "picture": timed(lambda: pictured.look(env.episode))[0],
+            "picture": timed(lambda: pictured.look(cam_from_world[0]))[0],  # noqa: B023
             "maps": timed(lambda: rasterise(*poses))[0],  # noqa: B023
             "colours": timed(lambda: rasterise(*poses, rgb=True))[0],  # noqa: B023
         }
         if terminated:
             env.reset()
     env.close()
+    pictured.close()
 
 
 def view_row(name: str, size: int, count: int) -> str:
     scene = in_size(name, size)
     times = list(view_times(scene, count))
     median = {key: statistics.median(each[key] for each in times) for key in times[0]}
-    triangles = sum(len(body.triangles) for body in Street.shared(scene).bodies)
+    triangles = sum(len(body.corners) for body in Street.shared(scene).bodies)
     cells = f"{scene.num_pedestrians} | {triangles} | {median['picture']:.2f}"
     for key in ("maps", "colours"):
         ratio = statistics.median(each["picture"] / each[key] for each in times)
@@ -103,19 +106,12 @@ def stepper(env: EnvBase, clock: Callable[[], float] = time.process_time) -> Cal
 
 
 def frame_row(name: str, size: int, num_envs: int, steps: int, rounds: int) -> str:
-    scene = in_size(name, size)
-    envs = [
-        make_env(scene, REPRESENTATIONS, num_envs=num_envs, seed=0, renderer=renderer)
-        for renderer in ("rasteriser", "pybullet")
-    ]
-    takers = [stepper(env) for env in envs]
-    times = [[take(steps) for take in takers] for _ in range(rounds + 1)][1:]  # one to warm up
-    parts = shares(envs[0], takers[0], steps)
-    for env in envs:
-        env.close()
-    ours, theirs = (statistics.median(each) for each in zip(*times))
-    ratio = statistics.median(b / a for a, b in times)
-    cells = f"{theirs:.2f} | {ours:.3f} | {ratio:.1f} | {1e3 / ours:.0f}"
+    env = make_env(in_size(name, size), REPRESENTATIONS, num_envs=num_envs, seed=0)
+    take = stepper(env)
+    ms = statistics.median([take(steps) for _ in range(rounds + 1)][1:])  # one to warm up
+    parts = shares(env, take, steps)
+    env.close()
+    cells = f"{ms:.3f} | {1e3 / ms:.0f}"
     return f"| {name} | {size} | {cells} | " + " | ".join(f"{part:.3f}" for part in parts) + " |"
 
 
@@ -183,11 +179,8 @@ def main() -> None:
         for row in rows:
             print(view_row(*row, args.views), flush=True)
         print(f"\n{args.num_envs} envs in one process, one thread, ms per frame")
-        print(
-            "| scene | pixels | PyBullet | flowrep | ratio | frames/s "
-            "| drive | sense | represent | rest |"
-        )
-        print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+        print("| scene | pixels | ms | frames/s | drive | sense | represent | rest |")
+        print("| --- | --- | --- | --- | --- | --- | --- | --- |")
         for row in rows:
             print(frame_row(*row, args.num_envs, args.steps, args.rounds), flush=True)
     if args.workers:

@@ -17,13 +17,13 @@ import pybullet
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from flowrep.simulator.camera import depth_from_zbuffer, gl_view, pose_of_view, sampled_intrinsics
 from flowrep.simulator.motion import instance_motion, rigid_inverse
 
 Array: TypeAlias = NDArray[Any]
 View: TypeAlias = Sequence[float]
 
 _TAG = "flowrep"
+_GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera has y up and z backward
 _RIGID, _SOFT = 1, 3  # what getDynamicsInfo returns as a body's type has no names in PyBullet
 
 
@@ -197,7 +197,8 @@ class BulletCamera:
         fx, fy = half[0] * float(matrix[0, 0]), half[1] * float(matrix[1, 1])
         K = np.array([[fx, 0.0, half[0]], [0.0, fy, half[1]], [0.0, 0.0, 1.0]])
         if _software_draws(self._client, self._picture["renderer"]):
-            K = sampled_intrinsics(fx, fy, self.height, self.width)
+            # It samples pixel (column i, row j), whose centre is (i + 0.5, j + 0.5), at (i, j + 1).
+            K[:2, 2] += 0.5, -0.5
         K[:2, 2] += half[0] * -float(matrix[0, 2]), half[1] * float(matrix[1, 2])  # off-centre
         return K, (float(near_m), float(far_m))
 
@@ -238,19 +239,19 @@ class BulletCamera:
         if self._link is None:
             if view is None:
                 raise ValueError("the camera has no view: give one to BulletCamera or to each call")
-            return pose_of_view(view)
+            return _pose_of_view(view)
         body, link = self._link
         for tag, each in bodies.items():
             if each.number == body and -1 <= link < len(each.parents):
                 world_from_link = poses[tag][1 + link] @ each.mass_from_link[1 + link]
-                return world_from_link if view is None else world_from_link @ pose_of_view(view)
+                return world_from_link if view is None else world_from_link @ _pose_of_view(view)
         raise ValueError(
             f"no body {body} with a link {link}; there are "
             f"{ {each.number: f'{len(each.parents)} links' for each in bodies.values()} }"
         )
 
     def _look(self, world_from_cam: Array) -> dict[str, Array]:
-        view = gl_view(rigid_inverse(world_from_cam))
+        view = (_GL_FROM_CV @ rigid_inverse(world_from_cam)).T.ravel().tolist()
         _, _, rgba, zbuffer, ids = self._client.getCameraImage(
             self.width, self.height, view, **self._picture
         )
@@ -259,7 +260,7 @@ class BulletCamera:
         zbuffer = np.asarray(zbuffer, dtype=np.float32).reshape(shape)
         # The z-buffer of the sky is close to 1, above or below, but seldom 1.
         is_sky = ids == -1
-        depth = depth_from_zbuffer(zbuffer, *self._range_m)
+        depth = _depth_from_zbuffer(zbuffer, *self._range_m)
         depth[is_sky] = np.inf
         # Ids are body + ((link + 1) << 24); the sky's -1 would be body 0xffffff, link 254.
         packed = np.where(is_sky, 0, ids).view(np.uint32)
@@ -436,6 +437,26 @@ class _Body:
             elif self.types[link] not in (pybullet.JOINT_REVOLUTE, pybullet.JOINT_PRISMATIC):
                 moved[link] = np.nan  # another joint, such as a planar one: unknown flow
         return moved
+
+
+def _pose_of_view(view: View) -> Array:
+    """Returns world_from_cam [4, 4], with OpenCV's axes, of the 16 numbers of a view matrix."""
+    numbers = np.asarray(view, dtype=np.float64)
+    if numbers.size != 16:
+        raise ValueError(f"a view has 16 numbers, column by column; got {numbers.size}")
+    gl_from_world = numbers.reshape(4, 4).T
+    rotation = gl_from_world[:3, :3]
+    if not abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3:
+        raise ValueError(f"a view is a rotation and a translation; got {numbers.tolist()}")
+    return rigid_inverse(gl_from_world) @ _GL_FROM_CV
+
+
+def _depth_from_zbuffer(zbuffer: Array, near_m: float, far_m: float) -> Array:
+    """Returns depth along z in metres, float32, from OpenGL depth-buffer values in [0, 1]."""
+    # The usual formula has far - (far - near) · z, which loses precision near z = 1. There, 1 - z
+    # is exact in float32.
+    gap = (np.float32(1.0) - zbuffer) * np.float32(far_m - near_m) + np.float32(near_m)
+    return np.float32(far_m * near_m) / gap
 
 
 def _transforms(positions: Sequence[View], quaternions_xyzw: Sequence[View]) -> Array:

@@ -64,11 +64,11 @@ def test_a_preset_asks_of_one_algorithm_what_others_do_not_have():
 @pytest.mark.parametrize(
     ("cores", "device", "change", "workers"),
     [
-        (1, "cpu", "renderer=auto", 0),
+        (1, "cpu", "motion=exact", 0),
         (2, "cpu", "threads=1", 1),
         (2, "cpu", "threads=2", 0),
         (2, "cpu", "num_workers=2", 2),
-        (2, "cuda", "renderer=auto", 2),
+        (2, "cuda", "motion=exact", 2),
         (3, "cpu", "threads=1", 2),
         (16, "cpu", "threads=1", 4),  # one for each environment
     ],
@@ -104,7 +104,7 @@ def test_flow_and_sensors_are_exact_unless_asked_otherwise():
     parameters = inspect.signature(EstimatedFlow).parameters
     assert config["flow"].pop("source") == "estimated"
     defaults = {name: parameters[name].default for name in config["flow"]}
-    # small maps from larger pictures, which needs a renderer
+    # small maps from larger pictures
     assert config["flow"] == defaults | {"picture_scale": 4, "preset": "fine"}
 
 

@@ -1,30 +1,36 @@
 """What a street's camera observes: maps, and motions of camera and bodies since the last step."""
 
 from collections.abc import Sequence, Set
-from typing import Any, TypeAlias, get_args
+from typing import Any, Protocol
 from weakref import WeakValueDictionary
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from flowrep.config.options import Renderer
 from flowrep.scenes.pedestrians import PARTS, world_from_parts
-from flowrep.scenes.scene import MOST_PX, num_classes
-from flowrep.simulator import camera
-from flowrep.simulator.bullet import Picture
+from flowrep.scenes.scene import MOST_PX, Path, num_classes
 from flowrep.simulator.motion import instance_motion, planar, relative_motion, rigid_inverse
-from flowrep.simulator.paint import SKY
 from flowrep.simulator.street import Street
 
-Episode: TypeAlias = Any  # this and `Moment` are street_env's, which imports this module
-Moment: TypeAlias = Any
 Array = NDArray[Any]
 Arrays = dict[str, Array]
 SENSORS = ("depth", "semantic", "instance", "prev_from_curr", "instance_motion", "rgb", "frame")
 EPISODE_SEEDS = 1 << 62  # seeds are smaller; a space of all numbers of int64 can't be sampled
 _MAPS = frozenset({"depth", "semantic", "instance"})
 _DRAWN = _MAPS | {"rgb"}
+
+
+class InView(Protocol):
+    """What the camera needs to know of an episode at its current step."""
+
+    seed: int
+    steps: int
+    path: Path
+    now: Any  # its `vehicle` is the state now, that of `before` one step ago
+    before: Any
+    poses: Array  # of people, [P, 4]
+    poses_before: Array
 
 
 class Sensing:
@@ -35,7 +41,7 @@ class Sensing:
     """
 
     @classmethod
-    def shared(cls, street: Street, sensors: Sequence[str], renderer: str, scale: int) -> "Sensing":
+    def shared(cls, street: Street, sensors: Sequence[str], scale: int) -> "Sensing":
         """Returns the one that all envs of the process with these options share."""
         config = street.layout.scene.camera
         most = MOST_PX // max(config.height_px, config.width_px)
@@ -43,16 +49,14 @@ class Sensing:
             raise ValueError(
                 f"picture_scale must be a whole number from 1 to {most}, got {scale!r}"
             )
-        if renderer not in (known := get_args(Renderer)):
-            raise ValueError(f"unknown renderer {renderer!r}; choose one of {', '.join(known)}")
         names = (sensors,) if isinstance(sensors, str) else tuple(sensors)
-        key = street, names, "rasteriser" if renderer == "auto" else renderer, scale
+        key = street, names, scale
         sensing = _SHARED.get(key)
         if sensing is None:
             sensing = _SHARED[key] = cls(*key)
         return sensing
 
-    def __init__(self, street: Street, sensors: Sequence[str], renderer: str, scale: int) -> None:
+    def __init__(self, street: Street, sensors: Sequence[str], scale: int) -> None:
         if unknown := [name for name in sensors if name not in SENSORS]:
             raise ValueError(f"unknown sensors {unknown}; they are: {', '.join(SENSORS)}")
         self.names = tuple(sensors)
@@ -61,27 +65,22 @@ class Sensing:
         self._size = config.height_px, config.width_px
         self._range_m = config.near_m, config.far_m
         self.K = config.K
-        self._projection = camera.gl_projection(config.focal_px, *self._size, *self._range_m)
-        self._vehicle_from_cam = camera.vehicle_from_camera(config)
-        self._ids_by_number = street.ids_by_number()
-        self.renderer, self._scale = renderer, scale
-        if scale != 1 and self.renderer == "pybullet":
-            remedy = "needs renderer 'rasteriser'; give 1 with 'pybullet'"
-            raise ValueError(f"picture_scale={scale} {remedy}")
+        self._vehicle_from_cam = config.vehicle_from_cam
+        self._scale = scale
         self._rasterisers: dict[int, Any] = {}  # by scale
-        if self.renderer != "pybullet" and not _DRAWN.isdisjoint(sensors):
+        if not _DRAWN.isdisjoint(sensors):
             self._rasteriser(1)  # so that it is compiled before the first step
 
-    def observe(self, episode: Episode) -> dict[str, Any]:
+    def observe(self, episode: InView) -> dict[str, Any]:
         """Returns an episode's current observation."""
         return {name: stack[0] for name, stack in self.observe_all([episode]).items()}
 
-    def observe_all(self, episodes: Sequence[Episode]) -> Arrays:
+    def observe_all(self, episodes: Sequence[InView]) -> Arrays:
         """Returns the current observations of N episodes, [N, ...], as `observe` returns each."""
         if not self.names:
             return {}
         names, views = _DRAWN.intersection(self.names), self.views(episodes)
-        observation = self._draw(episodes, views, names) if names else {}
+        observation = self._draw(views, names) if names else {}
         if not {"prev_from_curr", "instance_motion"}.isdisjoint(self.names):
             now = self._camera_poses([episode.now for episode in episodes])
             before = self._camera_poses([episode.before for episode in episodes])
@@ -97,15 +96,9 @@ class Sensing:
             observation["frame"] = np.array(named, dtype=np.int64)
         return {name: observation[name] for name in self.names}
 
-    def rgb(self, episode: Episode) -> NDArray[np.uint8]:
+    def rgb(self, episode: InView) -> NDArray[np.uint8]:
         """Returns the colour picture [H, W, 3] of an episode's current step."""
-        drawn = self._draw([episode], self.views([episode]), {"rgb"})
-        return drawn["rgb"][0].transpose(1, 2, 0)
-
-    def look(self, episode: Episode) -> Picture:
-        """Returns PyBullet's picture from an episode's camera, of bodies as last placed."""
-        view = camera.gl_view(rigid_inverse(self._camera_poses([episode.now])[0]))
-        return self._street.simulator.look(view, self._projection, *self._size)
+        return self._draw(self.views([episode]), {"rgb"})["rgb"][0].transpose(1, 2, 0)
 
     def space(self) -> spaces.Dict:
         """Returns the observation space."""
@@ -122,13 +115,8 @@ class Sensing:
         }
         return spaces.Dict({name: every[name] for name in self.names})
 
-    def _draw(
-        self, episodes: Sequence[Episode], views: tuple[Array, ...], names: Set[str]
-    ) -> Arrays:
-        """Returns at least the named maps and colours of N episodes, [N, ...]."""
-        if self.renderer == "pybullet":
-            pictured = [self._pictured(episode) for episode in episodes]
-            return {name: np.stack([maps[name] for maps in pictured]) for name in pictured[0]}
+    def _draw(self, views: tuple[Array, ...], names: Set[str]) -> Arrays:
+        """Returns at least the named maps and colours of N views, [N, ...]."""
         arrays = {}
         colours_too = "rgb" in names and self._scale == 1
         if colours_too or not names.isdisjoint(_MAPS):
@@ -138,7 +126,7 @@ class Sensing:
             arrays["rgb"] = self._rasteriser(self._scale)(*views, rgb=True).rgb
         return arrays
 
-    def views(self, episodes: Sequence[Episode]) -> tuple[Array, Array, Array]:
+    def views(self, episodes: Sequence[InView]) -> tuple[Array, Array, Array]:
         """Returns cam_from_world, the poses of people's parts, and which bodies exist, [N, ...]."""
         return (
             rigid_inverse(self._camera_poses([episode.now for episode in episodes])),
@@ -157,21 +145,7 @@ class Sensing:
             self._rasterisers[scale] = Rasteriser(self._street.triangles, K, size, self._range_m)
         return self._rasterisers[scale]
 
-    def _pictured(self, episode: Episode) -> Arrays:
-        # All envs share one PyBullet world, so people and exits are placed for each picture.
-        self._street.close_exits(episode.path.closures)
-        self._street.place_pedestrians(episode.poses)
-        picture = self.look(episode)
-        is_sky = picture.body < 0
-        depth = camera.depth_from_zbuffer(picture.zbuffer, *self._range_m)
-        depth[is_sky] = np.inf
-        semantic, instance = np.moveaxis(self._ids_by_number[picture.body], -1, 0)
-        rgb = picture.rgba[..., :3].transpose(2, 0, 1).copy()
-        rgb[:, is_sky] = np.array(SKY)[:, None]
-        maps = {"depth": depth, "semantic": semantic, "instance": instance}
-        return {name: array[None] for name, array in maps.items()} | {"rgb": rgb}
-
-    def _camera_poses(self, moments: Sequence[Moment]) -> Array:
+    def _camera_poses(self, moments: Sequence[Any]) -> Array:
         """Returns world_from_cam [N, 4, 4]."""
         x_m, y_m, yaw_rad, _ = np.array([moment.vehicle for moment in moments]).T
         return planar(x_m, y_m, yaw_rad) @ self._vehicle_from_cam

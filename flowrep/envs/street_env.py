@@ -223,7 +223,6 @@ class StreetEnv(gym.Env):
             seconds.
         sensors: the keys of the observation; without any, nothing is rendered.
         render_mode: "rgb_array" or None.
-        renderer: "rasteriser" (or "auto"), whose colours are textured, or "pybullet".
         picture_scale: size of `rgb` and of rendered pictures, as a multiple of the maps'. Flow
             estimated from larger pictures and averaged is more accurate.
 
@@ -243,7 +242,6 @@ class StreetEnv(gym.Env):
         frame_rate_hz: float | None = None,
         sensors: Sequence[str] = SENSORS[:5],
         render_mode: str | None = None,
-        renderer: str = "auto",
         picture_scale: int = 1,
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
@@ -258,7 +256,7 @@ class StreetEnv(gym.Env):
         self.metadata = {**self.metadata, "render_fps": self.frame_rate_hz}
         self.num_classes = num_classes(self.scene.categories)
         ticks_for(self.scene, self.frame_rate_hz, self.speed_mps, 0.0)
-        self._camera = sensors, renderer, picture_scale
+        self._camera = sensors, picture_scale
         self._episode: Episode | None = None
         self._open()
         self.K = self.sensing.K

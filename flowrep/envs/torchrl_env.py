@@ -73,7 +73,6 @@ def make_env(
     motion: str = "exact",
     noise: Mapping[str, float] | None = None,
     compiled: bool = False,
-    renderer: str = "auto",
     picture_scale: int = 1,
 ) -> TransformedEnv:
     """Returns a batched TorchRL env, always of batch size [num_envs].
@@ -92,7 +91,7 @@ def make_env(
         num_workers: number of processes that step the envs, see `WorkerVectorEnv`; 0 steps them in
             this process. The results are the same.
         device: device of the TensorDicts; streets are simulated on the CPU.
-        speed: see `StreetEnv`, as for `frame_rate_hz`, `renderer` and `picture_scale`.
+        speed: see `StreetEnv`, as for `frame_rate_hz` and `picture_scale`.
         seed: the seed from which the envs draw their episodes; with None, call `set_seed`.
         keep_sensor: whether to keep the ("sensor", ...) keys; rgb and frame are kept only if a
             representation needs them.
@@ -126,8 +125,7 @@ def make_env(
     if isinstance(flow, Mapping) and flow.get("source") == "estimated":
         flow = {"picture_scale": picture_scale, **flow}
         picture_scale = flow["picture_scale"]
-    drawn: Any = {"renderer": renderer, "picture_scale": picture_scale}
-    street = partial(StreetEnv, loaded, speed, frame_rate_hz, **drawn)
+    street = partial(StreetEnv, loaded, speed, frame_rate_hz, picture_scale=picture_scale)
     transforms = Compose()
     if representations:
         transforms = representation_stack(

@@ -42,7 +42,7 @@ class StreetVectorEnv(SyncVectorEnv):
     Observations are bitwise equal to those of the single envs. Later steps don't change them.
 
     Raises:
-        ValueError: the envs differ in scene, sensors, renderer or `picture_scale`.
+        ValueError: the envs differ in scene, sensors or `picture_scale`.
     """
 
     num_workers = 0
@@ -57,7 +57,7 @@ class StreetVectorEnv(SyncVectorEnv):
         cameras = {street.sensing for street in self._streets}
         if len(cameras) != 1:
             raise ValueError(
-                "environments that are drawn together need the same scene, sensors, renderer and "
+                "environments that are drawn together need the same scene, sensors and "
                 "picture_scale; make a vector env for each"
             )
         sensor: Any = self.single_observation_space

@@ -52,7 +52,6 @@ def env(config: EnvConfig, **changes: Any) -> EnvBase:
         "num_envs": num_envs,
         "device": device(config.device),
         "speed": config.speed,
-        "renderer": config.renderer,
     }
     arguments |= changes | {"num_workers": num_workers}
     maps = arguments["representations"]

@@ -211,7 +211,7 @@ def _picture_scale(config: EnvConfig) -> int:
     rgb is rendered at the size of a tile, unless the agent reads it. Estimators of flow get
     pictures of the config's size in any case.
     """
-    if "rgb" in config.representations or config.renderer == "pybullet":
+    if "rgb" in config.representations:
         return 1
     return tile_zoom(config.scene.camera.height_px, config.scene.camera.width_px)
 

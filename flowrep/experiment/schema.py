@@ -33,7 +33,6 @@ from flowrep.config.options import (
     FlowOptions,
     OneOrMore,
     Options,
-    Renderer,
     SpeedMode,
     Text,
     validated,
@@ -120,23 +119,11 @@ class EnvConfig(Command):
     speed: SpeedMode
     num_envs: Count
     num_workers: Workers
-    renderer: Renderer
     representations: MapOptions
     flow: FlowOptions
     motion: MotionChoice
     noise: dict[str, Any]
     scene: SceneSection
-
-    @model_validator(mode="after")
-    def _can_be_rendered(self) -> EnvConfig:
-        if (
-            self.renderer == "pybullet"
-            and (self.flow.model_extra or {}).get("picture_scale", 1) != 1
-        ):
-            raise ValueError(
-                "renderer=pybullet draws pictures only in the maps' size: add flow.picture_scale=1"
-            )
-        return self
 
 
 class Evaluation(Options):

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, Strict, StringConstraints
 
-from flowrep.config.options import FRAME_RATES_HZ, PRINCIPAL_POINT_SHIFT_PX, SpeedMode
+from flowrep.config.options import FRAME_RATES_HZ, SpeedMode
 
 Kind = Literal["house", "tree", "fence", "car", "traffic_light", "lamp_post"]
 Range = tuple[float, float]
@@ -147,9 +147,24 @@ class CameraConfig(Part):
     @property
     def K(self) -> NDArray[np.float64]:
         """The intrinsics [3, 3] of depth, class, instance and flow maps."""
-        # Not quite in the middle: see PRINCIPAL_POINT_SHIFT_PX.
-        cx_px, cy_px = np.array([self.width_px, self.height_px]) / 2 + PRINCIPAL_POINT_SHIFT_PX
+        # Half a pixel right of the middle and above it, as of PyBullet's software renderer, whose
+        # pictures the rasteriser's equal; `tests/envs/test_camera.py` measures this.
+        cx_px, cy_px = self.width_px / 2 + 0.5, self.height_px / 2 - 0.5
         return np.array([[self.focal_px, 0.0, cx_px], [0.0, self.focal_px, cy_px], [0.0, 0.0, 1.0]])
+
+    @property
+    def vehicle_from_cam(self) -> NDArray[np.float64]:
+        """The camera's pose on the vehicle [4, 4] (vehicle axes: x forward, z up)."""
+        pitch = math.radians(self.pitch_deg)
+        sine, cosine = math.sin(pitch), math.cos(pitch)
+        return np.array(
+            [
+                [0.0, sine, cosine, self.mount_forward_m],
+                [-1.0, 0.0, 0.0, 0.0],
+                [0.0, -cosine, sine, self.mount_height_m],
+                [0.0, 0.0, 0.0, 1.0],
+            ]
+        )
 
 
 def check_speed(key: str, speed_mps: float, camera: CameraConfig, frame_rate_hz: float) -> None:

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -20,15 +19,14 @@ Array = NDArray[np.float64]
 _CHUNK_TRIANGLES = 24
 
 
-@dataclass(frozen=True)
-class Body:
-    """A rigid body, with its ids in the maps."""
+class Body(NamedTuple):
+    """A rigid body of coloured triangles, with its ids in the maps."""
 
-    vertices: NDArray[np.float64]  # [V, 3], metres, in body coordinates; world if static
-    triangles: NDArray[np.int64]  # [T, 3], vertices, counter-clockwise seen from outside
+    corners: Array  # [T, 3, 3], metres, counter-clockwise seen from outside; in the body's
+    # coordinates, those of the world if it is static
+    uvs: Array  # [T, 3, 2], the corners' positions in the texture
     semantic: int
     instance: int  # 0 for the static world
-    uvs: NDArray[np.float64] | None = None  # [V, 2], in the texture; None is plain asphalt
 
 
 class Triangles(NamedTuple):
@@ -53,16 +51,12 @@ def gather(bodies: Sequence[Body]) -> Triangles:
     movers = iter(range(len(bodies)))
     for number, body in enumerate(bodies):
         pose = next(movers) if body.instance else -1
-        uvs = np.zeros((len(body.vertices), 2)) if body.uvs is None else body.uvs
-        triangles, corner_uvs = body.vertices[body.triangles], uvs[body.triangles]
-        for chunk in _chunks(triangles.mean(axis=1), np.arange(len(triangles))):
-            # Corners that triangles share are projected once. Meshes repeat vertices, for the sake
-            # of normals and texture coordinates, so equal points are merged here.
-            shared, inverse = np.unique(
-                triangles[chunk].reshape(-1, 3), axis=0, return_inverse=True
-            )
-            corners = inverse.reshape(-1, 3).astype(np.int32)
-            chunks.append((shared, corners, triangles[chunk], corner_uvs[chunk], number, pose))
+        for chunk in _chunks(body.corners.mean(axis=1), np.arange(len(body.corners))):
+            corners, uvs = body.corners[chunk], body.uvs[chunk]
+            # Corners that triangles share are projected once.
+            shared, inverse = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+            within = inverse.reshape(-1, 3).astype(np.int32)
+            chunks.append((shared, within, corners, uvs, number, pose))
     points, indices, corners_m, uvs_of_all, owners, poses = zip(*chunks)
     semantic = np.array([body.semantic for body in bodies], dtype=np.uint8)
     instance = np.array([body.instance for body in bodies], dtype=np.uint8)
@@ -106,27 +100,28 @@ _RISE_M = 0.004  # height of markings above the ground; at the same height the t
 
 
 class Mesh:
-    """Triangles with normals and texture coordinates, in PyBullet's order."""
+    """Coloured triangles, counter-clockwise seen from outside."""
 
     def __init__(self) -> None:
-        self.vertices: list[list[float]] = []
-        self.normals: list[list[float]] = []
-        self.uvs: list[list[float]] = []
-        self.indices: list[int] = []
+        self._corners: list[Array] = [np.empty((0, 3, 3))]
+        self._uvs: list[Array] = [np.empty((0, 3, 2))]
+
+    @property
+    def corners(self) -> Array:
+        """The triangles' corners [T, 3, 3], metres."""
+        return np.concatenate(self._corners)
+
+    @property
+    def uvs(self) -> Array:
+        """The corners' positions in the texture [T, 3, 2]."""
+        return np.concatenate(self._uvs)
 
     def polygon(self, corners: Array, uvs: list[list[float]]) -> None:
         """Adds a flat convex polygon [M, 3], counter-clockwise seen from outside."""
-        (ax, ay, az), (bx, by, bz) = (corners[1:3] - corners[0]).tolist()
-        # Written out, because numpy.cross would take most of the time in which a street is built.
-        normal = np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
-        normal /= np.linalg.norm(normal)
         # A fan of triangles from the first corner, which is only right for convex polygons.
-        base = len(self.vertices)
-        self.vertices += corners.tolist()
-        self.normals += [normal.tolist()] * len(corners)
-        self.uvs += uvs
-        for i in range(1, len(corners) - 1):
-            self.indices += [base, base + i, base + i + 1]
+        fan = [(0, i, i + 1) for i in range(1, len(corners) - 1)]
+        self._corners.append(corners[fan])
+        self._uvs.append(np.array(uvs)[fan])
 
     def quad(self, corners: Array, patch: Patch) -> None:
         """Adds a rectangle: bottom left, bottom right, top right, top left, seen from outside."""
@@ -185,16 +180,12 @@ class Mesh:
         """Turns the mesh and moves it on the ground."""
         sine, cosine = math.sin(yaw_rad), math.cos(yaw_rad)
         turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-        self.vertices = (np.array(self.vertices) @ turn.T + [x_m, y_m, 0.0]).tolist()
-        self.normals = (np.array(self.normals) @ turn.T).tolist()
+        self._corners = [self.corners @ turn.T + [x_m, y_m, 0.0]]
 
     def add(self, other: "Mesh") -> None:
         """Adds another mesh's triangles."""
-        base = len(self.vertices)
-        self.vertices += other.vertices
-        self.normals += other.normals
-        self.uvs += other.uvs
-        self.indices += [base + i for i in other.indices]
+        self._corners += other._corners
+        self._uvs += other._uvs
 
 
 def lane_marks(line: shapely.LineString, clear_of: shapely.Geometry) -> Mesh:

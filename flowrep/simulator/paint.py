@@ -1,7 +1,7 @@
 """Paint: plain colours and house fronts in one small texture, and the grain on every surface.
 
-PyBullet's pictures show the texture alone. The rasteriser multiplies it by a grain, so that flow
-can be estimated on roads and clothes, too; on plain asphalt, estimated flow is 0.
+The rasteriser multiplies the texture by the grain, so that flow can be estimated on roads and
+clothes, too; on plain asphalt, estimated flow is 0.
 """
 
 from functools import cache

@@ -1,4 +1,4 @@
-"""A scene as bodies in the simulator, which the camera sees and the vehicle can hit."""
+"""A scene as bodies that the camera sees, and as solids that the vehicle can hit."""
 
 import math
 import pickle
@@ -12,16 +12,15 @@ from numpy.typing import NDArray
 
 from flowrep.scenes import pedestrians
 from flowrep.scenes.layout import Box, Layout
-from flowrep.scenes.scene import CATEGORIES, CATEGORY_ID, Scene
+from flowrep.scenes.scene import CATEGORY_ID, Scene
 from flowrep.scenes.vehicle import VehicleState
 from flowrep.simulator import meshes
 from flowrep.simulator.bullet import Simulator
 from flowrep.simulator.meshes import Body, Mesh, gather, person_meshes
-from flowrep.simulator.paint import texture
 
 Array = NDArray[Any]
 _TWO_LANES_M = 5.0  # narrower roads have no lane marks
-_HIDDEN_M = -1000.0  # height of absent bodies, out of reach of camera and vehicle
+_HIDDEN_M = -1000.0  # height of absent solids, out of the vehicle's reach
 _SAFE_CELL_M = 0.25  # side of a cell of `SafeGround`
 _BOXES_A_BODY = 16  # PyBullet's limit for one compound shape
 
@@ -58,27 +57,27 @@ class Street:
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
         self.is_safe = SafeGround(layout)
-        self.simulator = Simulator(texture())
+        self.simulator = Simulator()
         self.bodies: list[Body] = []
-        self._numbers: list[int] = []  # PyBullet's, of the bodies
         vehicle, count = layout.scene.vehicle, layout.scene.num_pedestrians
         self._vehicle = self.simulator.add_box(vehicle.length_m, vehicle.width_m, vehicle.height_m)
         # A single cylinder serves all people: it is placed wherever the vehicle may touch a person.
         self._person = self.simulator.add_cylinder(pedestrians.RADIUS_M, pedestrians.HEIGHT_M)
-        self._boxes: list[tuple[Box, int]] = []  # all that can be hit, each with its body
+        self._boxes: list[tuple[Box, int]] = []  # all that can be hit, each with its solid
         self._add_ground(layout)
         self._add_solids([*layout.buildings, *layout.obstacles])
-        self._closures = {
-            name: self._add_solid([box], meshes.mesh_of(box, both_sides=True))
-            for name, box in layout.closures.items()
-        }
+        self._closures: dict[str, tuple[int, int]] = {}  # each one's body and solid
+        for name, box in layout.closures.items():
+            mesh = meshes.mesh_of(box, both_sides=True)
+            self._closures[name] = len(self.bodies), self._add_solid([box], mesh)
         parts = [mesh for i in range(count) for mesh in person_meshes(i)]
         for instance, mesh in enumerate(parts, start=1):
             self._add_body(mesh, "pedestrian", instance)
         self.triangles = gather(self.bodies)
         reach_m = math.hypot(vehicle.length_m, vehicle.width_m) / 2
         self._person_reach_m = reach_m + pedestrians.RADIUS_M
-        self._owners = np.array([body for _, body in self._boxes], dtype=int)
+        self._solids = np.array([solid for _, solid in self._boxes], dtype=int)
+        self._category_of = {solid: box.category for box, solid in self._boxes}
         self._centres = np.array([(box.x_m, box.y_m) for box, _ in self._boxes]).reshape(-1, 2)
         reaches = [math.hypot(*box.size_m[:2]) / 2 for box, _ in self._boxes]
         self._reaches_m = np.array(reaches) + reach_m
@@ -86,39 +85,20 @@ class Street:
     @classmethod
     def shared(cls, scene: Scene) -> "Street":
         """Returns the street that all envs of this process with this scene share."""
-        # A PyBullet client takes 28 MB. The key is pickled, because a scene contains mappings and
-        # has no hash.
+        # A street takes a second to build. The key is pickled, because a scene contains mappings
+        # and has no hash.
         key = pickle.dumps(scene)
         street = _STREETS.get(key)
         if street is None:
             street = _STREETS[key] = cls(Layout(scene))
         return street
 
-    def ids_by_number(self) -> NDArray[np.uint8]:
-        """Returns class and instance [N, 2] by PyBullet's number; the last row, -1, is the sky."""
-        ids = np.zeros((max(self._numbers) + 2, 2), dtype=np.uint8)
-        ids[self._numbers] = [(body.semantic, body.instance) for body in self.bodies]
-        return ids
-
     def is_shown(self, closures: tuple[str, ...]) -> NDArray[np.bool_]:
         """Returns which of the bodies are present while the named exits are closed."""
         shown = np.ones(len(self.bodies), dtype=bool)
-        for name, body in self._closures.items():
+        for name, (body, _) in self._closures.items():
             shown[body] = name in closures
         return shown
-
-    def close_exits(self, closures: tuple[str, ...]) -> None:
-        """Places the named closures and hides all others."""
-        for name, body in self._closures.items():
-            height_m = 0.0 if name in closures else _HIDDEN_M
-            self.simulator.place(self._numbers[body], 0.0, 0.0, 0.0, height_m)
-
-    def place_pedestrians(self, poses: Array) -> None:
-        """Places people at poses [P, 4], for a picture."""
-        transforms = pedestrians.world_from_parts(poses)
-        parts = self._numbers[len(self._numbers) - len(transforms) :]  # the bodies added last
-        for part, transform in zip(parts, transforms):
-            self.simulator.place_at(part, transform)
 
     def is_anyone_near(self, track: Sequence[VehicleState], poses: Array) -> Array:
         """Returns at which of T times a person, at poses [T, P, 4], is within touching distance."""
@@ -135,11 +115,12 @@ class Street:
             simulator.place(self._person, *pose)
             if simulator.touch(self._vehicle, self._person):
                 return "pedestrian"
-        self.close_exits(closures)
+        for name, (_, solid) in self._closures.items():
+            simulator.place(solid, 0.0, 0.0, 0.0, 0.0 if name in closures else _HIDDEN_M)
         is_near = np.hypot(*(self._centres - at).T) <= self._reaches_m
-        for body in dict.fromkeys(self._owners[is_near].tolist()):
-            if simulator.touch(self._vehicle, self._numbers[body]):
-                return CATEGORIES[self.bodies[body].semantic]
+        for solid in dict.fromkeys(self._solids[is_near].tolist()):
+            if simulator.touch(self._vehicle, solid):
+                return self._category_of[solid]
         return ""
 
     def _add_ground(self, layout: Layout) -> None:
@@ -162,7 +143,7 @@ class Street:
         grass.ground(layout.terrain, 0.0, "grass")
         grounds = {"road": road, "crosswalk": crosswalks, "sidewalk": paving, "terrain": grass}
         for category, mesh in grounds.items():
-            if mesh.indices:
+            if len(mesh.corners):
                 self._add_body(mesh, category)
 
     def _add_solids(self, boxes: list[Box]) -> None:
@@ -175,17 +156,14 @@ class Street:
                 self._add_solid(chunk, mesh)
 
     def _add_solid(self, boxes: list[Box], mesh: Mesh) -> int:
+        self._add_body(mesh, boxes[0].category)
         boxes_m = [(box.x_m, box.y_m, box.yaw_rad, *box.size_m) for box in boxes]
-        body = self._add_body(mesh, boxes[0].category, boxes_m=boxes_m)
-        self._boxes += [(box, body) for box in boxes]
-        return body
+        solid = self.simulator.add_boxes(boxes_m)
+        self._boxes += [(box, solid) for box in boxes]
+        return solid
 
-    def _add_body(self, mesh: Mesh, category: str, instance: int = 0, boxes_m: Any = ()) -> int:
-        vertices, uvs = np.array(mesh.vertices), np.array(mesh.uvs)
-        triangles, semantic = np.array(mesh.indices).reshape(-1, 3), CATEGORY_ID[category]
-        self.bodies.append(Body(vertices, triangles, semantic, instance, uvs))
-        self._numbers.append(self.simulator.add_body(mesh, boxes_m))
-        return len(self.bodies) - 1
+    def _add_body(self, mesh: Mesh, category: str, instance: int = 0) -> None:
+        self.bodies.append(Body(mesh.corners, mesh.uvs, CATEGORY_ID[category], instance))
 
 
 _STREETS: WeakValueDictionary[bytes, Street] = WeakValueDictionary()

@@ -3,65 +3,58 @@
 import math
 
 import numpy as np
+import pybullet
 import pytest
 
+from flowrep.pybullet import BulletCamera, _depth_from_zbuffer
 from flowrep.scenes.scene import CameraConfig
-from flowrep.simulator.bullet import Simulator
-from flowrep.simulator.camera import (
-    depth_from_zbuffer,
-    gl_projection,
-    gl_view,
-    sampled_intrinsics,
-    vehicle_from_camera,
-)
-from flowrep.simulator.meshes import Mesh
-from flowrep.simulator.paint import swatch, texture
 
 NEAR_M, FAR_M = 0.2, 300.0
-CAMERAS = [(36, 60, 40.0), (84, 84, 42.0), (61, 48, 55.0)]  # height, width, focal length
+CAMERAS = [(36, 60, 48.5), (84, 84, 90.0), (61, 48, 58.0)]  # height, width, vertical field of view
 
 
 @pytest.fixture(scope="module")
 def slanted_plane():
     """A plane whose z in the camera grows to the right and upwards: 0.6 x - 0.5 y - z = -6."""
-    simulator = Simulator(texture())
+    client = pybullet.connect(pybullet.DIRECT)
     # The camera's frame is the world's here: z forward. Corners on z = 6 + 0.6 x - 0.5 y.
     corners = [(x, y, 6 + 0.6 * x - 0.5 * y) for x, y in ((-5, 5), (5, 5), (5, -5), (-5, -5))]
-    mesh = Mesh()
-    mesh.quad(np.array(corners, dtype=float), swatch("asphalt"))
-    simulator.add_body(mesh)
-    return simulator
-
-
-def relative_depth_error(simulator, size, principal_point):
-    height, width, focal_px = size
-    projection = gl_projection(focal_px, height, width, NEAR_M, FAR_M)
-    seen = simulator.look(gl_view(np.eye(4)), projection, height, width)
-    depth = depth_from_zbuffer(seen.zbuffer, NEAR_M, FAR_M)
-    cx, cy = principal_point
-    x = (np.arange(width) + 0.5 - cx) / focal_px  # pixel (0, 0)'s centre is (0.5, 0.5)
-    y = (np.arange(height)[:, None] + 0.5 - cy) / focal_px
-    # z = 6 + 0.6 x z - 0.5 y z on the ray (x, y, 1) z.
-    inverse_truth = (1.0 - 0.6 * x + 0.5 * y) / 6.0
-    error = np.abs(depth * inverse_truth - 1.0)
-    hit = seen.body >= 0
-    assert hit.mean() > 0.5
-    return float(np.median(error[hit]))
+    mesh = {"vertices": corners, "indices": [0, 1, 2, 0, 2, 3], "physicsClientId": client}
+    seen = pybullet.createVisualShape(pybullet.GEOM_MESH, **mesh)
+    pybullet.createMultiBody(0, -1, seen, physicsClientId=client)
+    yield client
+    pybullet.disconnect(client)
 
 
 @pytest.mark.parametrize("size", CAMERAS)
 def test_the_sampled_intrinsics_put_unprojected_points_on_the_surface(slanted_plane, size):
-    height, width, focal_px = size
-    K = sampled_intrinsics(focal_px, focal_px, height, width)
-    assert relative_depth_error(slanted_plane, size, (K[0, 2], K[1, 2])) < 3e-6
+    height, width, fov_deg = size
+    view = np.diag([1.0, -1.0, -1.0, 1.0]).ravel().tolist()
+    camera = BulletCamera(
+        slanted_plane, width, height, fov_deg=fov_deg, near_m=NEAR_M, far_m=FAR_M, view=view
+    )
+    depth = camera.reset()["depth"][0]
+
+    def error(cx, cy):
+        x = (np.arange(width) + 0.5 - cx) / camera.K[0, 0]  # pixel (0, 0)'s centre is (0.5, 0.5)
+        y = (np.arange(height)[:, None] + 0.5 - cy) / camera.K[1, 1]
+        # z = 6 + 0.6 x z - 0.5 y z on the ray (x, y, 1) z.
+        errors = np.abs(depth * (1.0 - 0.6 * x + 0.5 * y) / 6.0 - 1.0)[np.isfinite(depth)]
+        assert errors.size > 0.5 * depth.size
+        return np.median(errors)
+
+    assert error(*camera.K[:2, 2]) < 3e-6
     # Rivals: the centred camera gives about 1e-2, the shift taken the other way twice that.
     for cx, cy in ((width / 2, height / 2), (width / 2 - 0.5, height / 2 + 0.5)):
-        assert relative_depth_error(slanted_plane, size, (cx, cy)) > 5e-3
+        assert error(cx, cy) > 5e-3
+    # A street's camera has the same K.
+    same = CameraConfig(height, width, fov_deg, 1.5, 0.0, 0.0, NEAR_M, FAR_M)
+    np.testing.assert_allclose(same.K, camera.K, rtol=1e-6)
 
 
 def test_depth_buffer_ends_are_near_and_far():
     # OpenGL: 0 is the near plane, 1 the far one; 0.5 of near 1, far 3 is 3 / (3 - 2 * 0.5) = 1.5.
-    depth = depth_from_zbuffer(np.array([0.0, 0.5, 1.0], dtype=np.float32), 1.0, 3.0)
+    depth = _depth_from_zbuffer(np.array([0.0, 0.5, 1.0], dtype=np.float32), 1.0, 3.0)
     np.testing.assert_allclose(depth, [1.0, 1.5, 3.0], rtol=1e-6)
     assert depth.dtype == np.float32
 
@@ -77,7 +70,7 @@ def test_the_focal_length_follows_the_vertical_field_of_view():
 
 def test_the_mount_points_the_camera_forward_and_pitches_it_up():
     camera = CameraConfig(48, 48, 90.0, 1.5, 0.4, 30.0, NEAR_M, FAR_M)
-    mount = vehicle_from_camera(camera)
+    mount = camera.vehicle_from_cam
     # A point 2 m ahead of the camera: 30° upwards is +1 m of height and 1.732 m forward.
     ahead = mount @ [0.0, 0.0, 2.0, 1.0]
     np.testing.assert_allclose(ahead, [0.4 + math.sqrt(3), 0.0, 2.5, 1.0], atol=1e-12)

@@ -13,11 +13,13 @@ import numpy as np
 import pytest
 import shapely
 
+from benchmarks.pybullet_view import PyBulletView
 from flowrep.envs import StreetEnv
 from flowrep.envs.street_env import Moment
 from flowrep.scenes import load_scene, scene_names
 from flowrep.scenes.scene import CATEGORY_ID, Scene
 from flowrep.scenes.vehicle import VehicleState
+from flowrep.simulator.street import Street
 
 MAPS = ("depth", "semantic", "instance")
 VIEWS_AN_EPISODE = 10
@@ -29,16 +31,18 @@ CROSSROADS = Path(__file__).parents[1] / "scenes" / "crossroads.yaml"
 def views(scene: Scene, count: int) -> Iterator[tuple[Any, Any]]:
     """Yields what PyBullet and the rasteriser see of a street from `count` places."""
     rng = np.random.default_rng(0)
-    envs = [StreetEnv(scene, sensors=MAPS, renderer=name) for name in ("pybullet", "rasteriser")]
+    env = StreetEnv(scene, sensors=MAPS)
+    pictured = PyBulletView(Street.shared(env.scene), env.scene.camera)
     for number in range(count):
         if number % VIEWS_AN_EPISODE == 0:
             episode_seed, ticks = int(rng.integers(1 << 31)), int(rng.integers(LATEST_TICK))
-            for env in envs:
-                env.reset(options={"episode_seed": episode_seed})
-        there = viewpoint(envs[1], rng, before_a_person=number % 2 == 1)
-        for env in envs:
-            env.episode.resume(Moment(there, ticks), Moment(there, ticks))
-        yield tuple(env.sensing.observe(env.episode) for env in envs)
+            env.reset(options={"episode_seed": episode_seed})
+        there = viewpoint(env, rng, before_a_person=number % 2 == 1)
+        env.episode.resume(Moment(there, ticks), Moment(there, ticks))
+        cam_from_world, world_from_part, is_shown = env.sensing.views([env.episode])
+        pictured.place(world_from_part[0], is_shown[0])
+        yield pictured.maps(cam_from_world[0]), env.sensing.observe(env.episode)
+    pictured.close()
 
 
 def viewpoint(env: StreetEnv, rng: np.random.Generator, *, before_a_person: bool) -> VehicleState:

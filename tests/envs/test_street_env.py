@@ -84,7 +84,7 @@ def test_maps_show_sky_road_sidewalk_houses_and_people(make_street):
 
 def test_the_vehicle_sees_nothing_of_itself(make_street, empty_road):
     behind = replace(empty_road.camera, mount_forward_m=-3.0)
-    env = make_street(replace(empty_road, camera=behind), renderer="pybullet")
+    env = make_street(replace(empty_road, camera=behind))
     observation, _ = env.reset(seed=0)
     assert set(np.unique(observation["semantic"][0, 50:, 36:48])) == {1}
 
@@ -245,8 +245,6 @@ def test_reset_options_set_speed_and_frame_rate_of_one_episode(make_street):
         ({"frame_rate_hz": "12"}, r"frame_rate_hz is '12'"),
         ({"frame_rate_hz": [12]}, r"frame_rate_hz is \[12\]"),
         ({"sensors": ("depth", "lidar")}, r"unknown sensors \['lidar'\].* depth, "),
-        ({"renderer": "opengl"}, r"unknown renderer 'opengl'.* rasteriser"),
-        ({"renderer": "pybullet", "picture_scale": 2}, "picture_scale=2 needs"),
         ({"picture_scale": 1.5}, "picture_scale.* 1.5"),
         ({"picture_scale": 49}, "picture_scale.* 1 to 48, got 49"),  # 49 · 84 px are more than 4K
         ({"picture_scale": "2"}, "picture_scale.* '2'"),
@@ -258,11 +256,10 @@ def test_invalid_arguments_are_refused(arguments, message):
         StreetEnv(**arguments)
 
 
-def test_numba_is_imported_only_to_draw_with_the_default_renderer(monkeypatch):
+def test_numba_is_imported_only_to_draw(monkeypatch):
     # None is what Python finds where a module can't be imported.
     monkeypatch.setitem(sys.modules, "flowrep.simulator.rasteriser", None)
     StreetEnv(sensors=("prev_from_curr", "frame")).close()
-    StreetEnv(renderer="pybullet").close()
     with pytest.raises(ImportError):
         StreetEnv(picture_scale=7)  # no open env has this camera, which would be shared
 

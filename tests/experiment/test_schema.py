@@ -45,7 +45,6 @@ def refusal(command, model, line):
         "representations=[]",
         "representations.ego=null",
         "+representations.rgb=null",
-        "renderer=pybullet flow=estimated",  # whose picture_scale is 4
         # keys
         "~seed",
         "+algorithm.gama=0.9",
@@ -73,7 +72,6 @@ def test_a_value_that_can_not_be_is_named(line):
         "algorithm.batch_size=32",
         "algorithm=ppo total_frames=2048",
         "algorithm.replay_capacity=64 num_envs=32",
-        "renderer=pybullet flow=estimated flow.picture_scale=1",
         "seed=2147483647 algorithm.gamma=1 algorithm.tau=1 evaluation.baselines=[]",
         "resume=there total_frames=512",  # the run's own algorithm decides whether that is enough
         "algorithm._target_=my.Own +algorithm.mine=3",

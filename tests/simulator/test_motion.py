@@ -6,10 +6,9 @@ import torch
 
 from flowrep import geometry
 from flowrep.scenes.scene import CameraConfig
-from flowrep.simulator.camera import vehicle_from_camera
 from flowrep.simulator.motion import instance_motion, planar, relative_motion, rigid_inverse
 
-MOUNT = vehicle_from_camera(CameraConfig(48, 60, 70.0, 1.5, 0.4, -10.0, 0.2, 100.0))
+MOUNT = CameraConfig(48, 60, 70.0, 1.5, 0.4, -10.0, 0.2, 100.0).vehicle_from_cam
 BODIES_BEFORE = np.stack([planar(10.0, 2.0, 0.1), planar(12.0, -3.0, 1.0), planar(8.0, 0.0, 3.0)])
 BODIES = np.stack([planar(10.1, 2.2, 0.4), planar(12.0, -3.0, 1.0), planar(7.9, 0.0, 3.0)])
 

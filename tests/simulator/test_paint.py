@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flowrep.scenes import scene_names
-from flowrep.simulator.meshes import Body, gather
+from flowrep.simulator.meshes import Body, Mesh, gather
 from flowrep.simulator.paint import AMBIENT, DIFFUSE, GRAIN_SIZE, LIGHT, PAINTS, grain, swatch
 from flowrep.simulator.rasteriser import Rasteriser, _find_texels
 
@@ -16,10 +16,10 @@ SHIRT = np.array(PAINTS["shirt_red"])
 
 def rectangle(paint, semantic, x, y, z=0.0, *, instance=0):
     """A level rectangle that faces up, of x and y from their first to their second number."""
+    mesh = Mesh()
     corners = [(x[0], y[0], z), (x[1], y[0], z), (x[1], y[1], z), (x[0], y[1], z)]
-    uvs = np.array([swatch(paint)[:2]] * 4)
-    triangles = np.array([(0, 1, 2), (0, 2, 3)])
-    return Body(np.array(corners), triangles, semantic, instance, uvs)
+    mesh.quad(np.array(corners), swatch(paint))
+    return Body(mesh.corners, mesh.uvs, semantic, instance)
 
 
 def seen_from_above(*bodies, x=0.0, y=0.0, height_m=2.0, size=(40, 60), focal_px=40.0, poses=()):
@@ -99,21 +99,6 @@ def test_the_levels_of_the_grain_are_the_same_pattern_ever_coarser():
     assert fine[..., 0].std() == pytest.approx(1.0, abs=0.1)
 
 
-@pytest.mark.slow_after_first
-@pytest.mark.parametrize("name", scene_names())
-def test_both_renderers_paint_streets_alike(name, make_street):
-    pictured, drawn = (
-        make_street(name, sensors=("rgb", "semantic"), renderer=renderer)
-        for renderer in ("pybullet", "rasteriser")
-    )
-    theirs, ours = (env.reset(options={"episode_seed": 7})[0] for env in (pictured, drawn))
-    for semantic in np.intersect1d(theirs["semantic"], ours["semantic"]):
-        where = (theirs["semantic"] == semantic) & (ours["semantic"] == semantic)
-        if where.sum() >= 300:
-            means = [view["rgb"][:, where[0]].mean(axis=1) for view in (theirs, ours)]
-            np.testing.assert_allclose(*means, atol=25)
-
-
 @pytest.mark.parametrize("scale", [1, 3])
 def test_pictures_may_be_larger_than_maps(scale, make_street, straight_road):
     camera = dataclasses.replace(straight_road.camera, height_px=20, width_px=30)
@@ -140,7 +125,7 @@ def test_estimated_flow_follows_the_road(name, make_street):
     from flowrep.transforms.estimated_flow import DIS
 
     sensors = ("depth", "semantic", "instance", "instance_motion", "rgb")
-    env = make_street(name, sensors=sensors, renderer="rasteriser")
+    env = make_street(name, sensors=sensors)
     previous, _ = env.reset(options={"episode_seed": 5})
     errors = []
     for _ in range(12):

@@ -18,8 +18,8 @@ WALL, BALL = (3, 0), (4, 7)  # class, instance
 
 def quad(corners, ids=WALL):
     """A body of one quadrangle, counter-clockwise seen from its outside."""
-    triangles = np.array([(0, 1, 2), (0, 2, 3)])
-    return Body(np.array(corners, dtype=float), triangles, *ids)
+    triangles = np.array(corners, dtype=float)[[(0, 1, 2), (0, 2, 3)]]
+    return Body(triangles, np.zeros((2, 3, 2)), *ids)
 
 
 def facing(z, x0, x1, y0, y1, ids=WALL):
@@ -123,7 +123,6 @@ def test_neighbouring_triangles_leave_no_gap():
     # A fan of thin triangles around a point that is no pixel's centre covers everything.
     angles = np.linspace(0, 2 * math.pi, 61)[:-1]
     rim = np.stack([50 * np.cos(angles), 50 * np.sin(angles), np.full(60, 3.0)], axis=1)
-    vertices = np.concatenate([[(0.123, -0.077, 3.0)], rim])
-    around = 1 + np.arange(60)
-    triangles = np.stack([np.zeros(60, int), np.roll(around, -1), around], axis=1)
-    assert np.isfinite(see(Body(vertices, triangles, *WALL))[0]).all()
+    middle = np.tile((0.123, -0.077, 3.0), (60, 1))
+    corners = np.stack([middle, np.roll(rim, -1, axis=0), rim], axis=1)
+    assert np.isfinite(see(Body(corners, np.zeros((60, 3, 2)), *WALL))[0]).all()
