@@ -67,10 +67,9 @@ class SensorNoise(MapTransform):
     `"next"`, and there is no state to save.
 
     Without it, each call draws new noise. On a replay buffer that is augmentation: the root and
-    `"next"` get independent errors. The generator is on the maps' device and its state is part of
-    `state_dict`, so that a resumed run continues the sequence. The envs of a `SerialEnv` or
-    `ParallelEnv` draw independent noise unless all get the same seed, or are copies of an env that
-    has been used.
+    `"next"` get independent errors. The calls so far are counted in `state_dict`, so that a resumed
+    run continues the sequence. The envs of a `SerialEnv` or `ParallelEnv` draw independent noise
+    unless all get the same seed, or are copies of an env that has been used.
 
     Args:
         sensors: which of `"depth"`, `"motion"` and `"flow"` to read and write.
@@ -79,9 +78,9 @@ class SensorNoise(MapTransform):
         drift_m: standard deviation per step of the motion's translation along each axis, metres.
         drift_rad: standard deviation per step of its rotation about each axis, radians.
         flow_sigma_px: standard deviation of each flow channel, pixels per step.
-        seed: of the generator; envs with the same seed have the same noise. None derives it from
-            torch's global generator (`torch.manual_seed` makes it reproducible) and the name of
-            the worker process; with `frame_key`, None is 0.
+        seed: envs with the same seed have the same noise. None draws one from torch's global
+            generator (`torch.manual_seed` makes it reproducible), and adds the name of the worker
+            process; with `frame_key`, None is 0.
         frame_key: key of the integers that identify the frame, such as StreetEnv's
             `("sensor", "frame")`.
         in_keys: one key for each sensor; the table's by default.
@@ -98,6 +97,9 @@ class SensorNoise(MapTransform):
         >>> bool(error[..., 0].abs() < 0.05), bool(error[..., 1].abs() < 5.0)
         (True, True)
     """
+
+    # What distinguishes calls without frames: a number drawn, and the count of calls.
+    drawn_and_calls: Tensor | None
 
     def __init__(
         self,
@@ -140,8 +142,10 @@ class SensorNoise(MapTransform):
         )
         self.sensors, self.options = tuple(sensors), options
         self.seed = None if seed is None else checked_count("seed", seed, 0)
-        self.has_frames = bool(frame)
-        self._state: Tensor | None = None  # of the generator, after what has been drawn
+        state = None if frame else torch.zeros(2, dtype=torch.int64)
+        if state is not None and seed is None:
+            state[0] = torch.randint(2**62, ())
+        self.register_buffer("drawn_and_calls", state)
 
     def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
         maps = super()._read(tensordict)
@@ -152,52 +156,39 @@ class SensorNoise(MapTransform):
 
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
         """Returns the sensors' maps with noise; with `frame_key`, frames are the last map."""
-        frame = maps[-1] if self.has_frames else None
+        state = self.drawn_and_calls
+        batch = maps[0].shape[: maps[0].ndim - len(self.reads[0].shape)]
+        frame = maps[-1] if state is None else self._next_frames(state, batch, maps[0].device)
         return tuple(self._noisy(sensor, x, frame) for sensor, x in zip(self.sensors, maps))
 
-    def _noisy(self, sensor: str, value: Tensor, frame: Tensor | None) -> Tensor:
+    def _noisy(self, sensor: str, value: Tensor, frame: Tensor) -> Tensor:
         options = [self.options[name] for name in NOISY_SENSORS[sensor].options]
         if not any(options):
             return value
-        normals, uniforms = self._numbers(sensor, value, frame)
-        normals = normals.to(value.dtype)
+        shape = (6,) if sensor == "motion" else tuple(value.shape[frame.ndim - 1 :])
+        stream = list(NOISY_SENSORS).index(sensor)
+        bits = frame_bits(frame, shape, seed=self.seed or 0, stream=stream)
+        normals = normal(bits).to(value.dtype)
         if sensor == "depth":
-            return noisy_depth(value, normals, uniforms, sigma_per_m=options[0], dropout=options[1])
+            sigma, dropout = options
+            return noisy_depth(value, normals, uniform(bits), sigma_per_m=sigma, dropout=dropout)
         if sensor == "motion":
             return drifted_motion(value, normals, drift_m=options[0], drift_rad=options[1])
         return value + options[0] * normals
 
-    def _numbers(self, sensor: str, value: Tensor, frame: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Returns normal numbers, one per pixel or six per motion, and uniform ones for depth."""
-        rank, device = len(NOISY_SENSORS[sensor].reads.shape), value.device
-        batch = value.shape[: value.ndim - rank]
-        shape = (6,) if sensor == "motion" else tuple(value.shape[-rank:])
-        uniforms = torch.empty(0, device=device)
-        if frame is not None:
-            stream = list(NOISY_SENSORS).index(sensor)
-            bits = frame_bits(frame, shape, seed=self.seed or 0, stream=stream)
-            return normal(bits), uniform(bits) if sensor == "depth" else uniforms
-        # Each call makes a new generator and replaces the state, never changes it in place: copies
-        # of the transform, TorchRL's shallow clones among them, then draw independently.
-        generator = torch.Generator(device)
-        if self._state is None:
-            generator.manual_seed(_drawn_seed() if self.seed is None else self.seed)
-        else:
-            generator.set_state(self._state)
-        # Always in this order, or a resumed run would draw other numbers.
-        normals = torch.randn((*batch, *shape), generator=generator, device=device)
-        if sensor == "depth":
-            uniforms = torch.rand((*batch, *shape), generator=generator, device=device)
-        self._state = generator.get_state()
-        return normals, uniforms
-
-    def get_extra_state(self) -> Tensor:
-        """Returns the generator's state for `state_dict`, empty before the first use."""
-        return torch.empty(0, dtype=torch.uint8) if self._state is None else self._state
-
-    def set_extra_state(self, state: Tensor) -> None:
-        """Makes the next call continue from a `state_dict`, on a device of the same type."""
-        self._state = state.clone().cpu() if len(state) else None
+    def _next_frames(self, state: Tensor, batch: Sequence[int], device: torch.device) -> Tensor:
+        """Returns integers `[*B, 3]` that no other call has: what was drawn, the call, the row."""
+        drawn, calls = state.to(device).unbind()
+        if self.seed is None:  # at the first call, which a worker makes in its process
+            drawn = torch.where(calls == 0, drawn ^ _number_of_process(), drawn)
+        rows = torch.arange(math.prod(batch), device=device).reshape(batch)
+        frames = torch.stack([drawn.expand(batch), calls.expand(batch), rows], -1)
+        following = torch.stack([drawn, calls + 1])
+        if torch.compiler.is_exporting():  # a program has a buffer of its own, and counts in it
+            state.copy_(following)
+        else:  # copies of the transform, such as TorchRL's shallow clones, have it in common
+            self.drawn_and_calls = following
+        return frames
 
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
         """Returns unbounded specs, as errors are unbounded."""
@@ -205,12 +196,12 @@ class SensorNoise(MapTransform):
         return tuple(Unbounded(s.shape, device=s.device, dtype=s.dtype) for s in seen)
 
 
-def _drawn_seed() -> int:
-    """Returns a seed that differs between envs in one process and between worker processes."""
+@torch.compiler.assume_constant_result
+def _number_of_process() -> int:
+    """Returns a number that differs between worker processes."""
     # Forked workers share the state of torch's generator, spawned ones its default seed: only their
     # names differ.
-    drawn = int(torch.randint(2**62, ()))
-    return drawn ^ zlib.crc32(multiprocessing.current_process().name.encode())
+    return zlib.crc32(multiprocessing.current_process().name.encode())
 
 
 def noisy_depth(

@@ -263,7 +263,8 @@ def _noise(
     options = {sensor: NOISY_SENSORS[sensor].options for sensor in _NOISY_KEYS}
     known = dict.fromkeys((name for names in options.values() for name in names), 0.0)
     given: Arguments = known | _known_options("noise", noise, known)
-    SensorNoise(**given)  # checks all values, used or not
+    frame: NestedKey = ("sensor", "frame")
+    SensorNoise(**given, frame_key=frame)  # checks all values, used or not
     split = [name for name in chosen if name in ("ego", "obj")]
     readers = {  # raw flow is exact or estimated from pictures: it needs no noisy sensor
         "depth": [name for name in chosen if name in ("depth", "depth2", *split)],
@@ -275,7 +276,7 @@ def _noise(
     transform = SensorNoise(
         sensors=noisy,
         **{name: given[name] for sensor in noisy for name in options[sensor]},
-        frame_key=("sensor", "frame"),
+        frame_key=frame,
         out_keys=[_NOISY_KEYS[sensor] for sensor in noisy],
     )
     transform.label = " and ".join(readers["depth"])
