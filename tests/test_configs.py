@@ -110,7 +110,7 @@ def test_flow_and_sensors_are_exact_unless_asked_otherwise():
 
 @pytest.mark.parametrize("name", group_choices("representations"))
 def test_a_representation_spells_out_its_options_with_the_transforms_defaults(name):
-    from flowrep.transforms.stack import representation_options
+    from flowrep.transforms.representations import representation_options
 
     given = plain("train", f"representations=[{name}]")["representations"][name]
     assert given == representation_options(name)

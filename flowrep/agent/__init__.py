@@ -4,14 +4,10 @@ from flowrep.extras import require
 
 require("flowrep.agent", "train", "safetensors", "pydantic")
 
-from flowrep.agent.algorithm import (
-    Algorithm,
-    DivergenceError,
-    OffPolicy,
-    keep_freed_memory,
-    torch_threads,
-)
+from flowrep.agent.algorithm import Algorithm, OffPolicy
 from flowrep.agent.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from flowrep.agent.cpu import keep_freed_memory, torch_threads
+from flowrep.agent.divergence import DivergenceError
 from flowrep.agent.dqn import DoubleDQN
 from flowrep.agent.dsac import DiscreteSAC
 from flowrep.agent.dsac_v import DiscreteSACWithValue

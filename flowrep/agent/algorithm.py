@@ -5,34 +5,23 @@
 
 from __future__ import annotations
 
-import ctypes
-import math
-import platform
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
-from tensordict.nn import CudaGraphModule
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs import Transform
 from torchrl.objectives import LossModule, SoftUpdate
 
+from flowrep.agent.cuda_graph import as_cuda_graph
+from flowrep.agent.divergence import DivergenceWatch
 from flowrep.agent.networks import DiscreteActions, acting_network, stochastic_policy
 from flowrep.agent.observation import MapCodec
 from flowrep.agent.replay import OUTCOME, ReplayMemory
 from flowrep.config.algorithms import AlgorithmOptions, OffPolicyOptions
-
-Step = Callable[[TensorDictBase], TensorDictBase]
-WARM_UP = 3  # eager updates before the graph is captured; they create Adam's moments and caches
-
-# mallopt's parameter numbers, from glibc's malloc.h.
-_M_TRIM_THRESHOLD = -1
-_M_MMAP_THRESHOLD = -3
-_THRESHOLD_BYTES = 1 << 30
 
 
 class Algorithm(ABC):
@@ -363,116 +352,3 @@ def weights_of(loss: LossModule) -> dict[str, Tensor]:
     weights = dict(loss.named_parameters()) | targets
     encoders = [name for name in weights if "encoder" in name.partition(".")[0]]
     return {name: weights[name] for name in (*encoders, *weights)}
-
-
-class DivergenceError(ArithmeticError):
-    """A loss or another watched metric became nan or infinite; the message names it."""
-
-
-class DivergenceWatch:
-    """Keeps, on the device, the metrics of the first update in which a `watched` one isn't finite.
-
-    Its tensors change in place, so that it works within a CUDA graph.
-    """
-
-    def __init__(
-        self, watched: Sequence[str], others: Sequence[str] = (), device: torch.device | str = "cpu"
-    ) -> None:
-        self.watched, self.names = tuple(watched), (*watched, *others)
-        self._values = torch.zeros(len(self.names), device=device)
-        self._good_updates = torch.zeros((), dtype=torch.long, device=device)
-        self.is_bad = torch.zeros((), device=device)  # 1.0 from the first bad update on
-
-    def reset(self, good_updates: int = 0) -> None:
-        """Forgets all metrics; `good_updates` is the number of updates so far."""
-        self._values.zero_()
-        self._good_updates.fill_(good_updates)
-        self.is_bad.zero_()
-
-    def record(self, metrics: Mapping[str, Tensor]) -> None:
-        """Records an update's metrics, unless an earlier one was bad."""
-        values = torch.stack([metrics[name].float() for name in self.names])
-        self._values.copy_(torch.where(self.is_bad.bool(), self._values, values))
-        is_good = self._values[: len(self.watched)].isfinite().all()
-        self._good_updates += is_good
-        self.is_bad.copy_(~is_good)
-
-    def check(self) -> None:
-        """Waits for the device and raises a `DivergenceError` if an update has diverged."""
-        values = dict(zip(self.names, self._values.tolist()))
-        bad = [name for name in self.watched if not math.isfinite(values[name])]
-        if bad:
-            raise DivergenceError(
-                f"{bad[0]} became {values[bad[0]]:g} in update {int(self._good_updates) + 1} "
-                f"({', '.join(f'{name}={value:g}' for name, value in values.items())})"
-            )
-
-
-def as_cuda_graph(step: Step, device: torch.device) -> Step:
-    """Returns an equivalent of `step` that runs as a CUDA graph from its fourth call on.
-
-    The graph replays the same kernels on the same memory. Values that change between calls must
-    therefore reach `step` through its argument or through tensors changed in place, and `step`
-    must not copy numbers between host and device. On any device but CUDA it is `step` itself.
-    """
-    if device.type != "cuda":
-        return step
-    return with_fixed_layout(
-        CudaGraphModule(step, warmup=WARM_UP, in_keys=[], out_keys=[], device=device)
-    )
-
-
-def with_fixed_layout(step: Step) -> Step:
-    """Returns `step` with a check that each batch has the layout of the first one.
-
-    A graph copies each batch into the memory of the first one. Without the check, a batch of one
-    row would silently be broadcast, numbers would be cast, and a missing map would keep its old
-    values.
-    """
-    first: dict[Any, tuple[Any, ...]] = {}
-
-    def checked(batch: TensorDictBase) -> TensorDictBase:
-        items = batch.items(include_nested=True, leaves_only=True)
-        layout = {key: (tuple(value.shape), value.dtype) for key, value in items}
-        first.update(() if first else layout)
-        # Compare only the keys of the first batch: a loss may add keys to a batch that is reused.
-        for key, expected in first.items():
-            if layout.get(key) != expected:
-                raise ValueError(
-                    f"the update is a CUDA graph of batches with {key!r} {expected}, this one has "
-                    f"it {layout.get(key, 'absent')}: keep the layout of batches fixed, or call "
-                    "step_eagerly() on the algorithm"
-                )
-        return step(batch)
-
-    return checked
-
-
-def keep_freed_memory() -> bool:
-    """Makes glibc reuse large freed blocks; returns whether that worked (False without glibc).
-
-    Call it once and early, because it doesn't affect blocks that are already allocated.
-    """
-    # By default, glibc maps every block above a threshold (32 MiB at most) and unmaps it when
-    # freed, so the kernel zeroes each activation of a large batch page by page in every update.
-    # With both thresholds at 1 GiB, the blocks stay in the heap.
-    if platform.libc_ver()[0] != "glibc":
-        return False
-    mallopt = ctypes.CDLL(None).mallopt
-    mallopt.argtypes, mallopt.restype = (ctypes.c_int, ctypes.c_int), ctypes.c_int
-    accepted = mallopt(_M_MMAP_THRESHOLD, _THRESHOLD_BYTES)
-    return bool(accepted and mallopt(_M_TRIM_THRESHOLD, _THRESHOLD_BYTES))
-
-
-@contextmanager
-def torch_threads(count: int) -> Iterator[None]:
-    """Makes PyTorch use `count` threads inside the context.
-
-    The number of threads changes how sums are rounded, so only the same number gives the same bits.
-    """
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

@@ -20,7 +20,7 @@ from flowrep.envs.vector_env import StreetVectorEnv
 from flowrep.scenes.scene import Scene
 from flowrep.transforms import representation_stack
 from flowrep.transforms.flow import Intrinsics
-from flowrep.transforms.stack import Representations
+from flowrep.transforms.representations import Representations
 
 _NEXT_STEP = gym.vector.AutoresetMode.NEXT_STEP
 Maps = NDArray[Any] | dict[str, NDArray[Any]]

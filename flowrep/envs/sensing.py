@@ -73,7 +73,7 @@ class Sensing:
 
     def observe(self, episode: InView) -> dict[str, Any]:
         """Returns an episode's current observation."""
-        return {name: stack[0] for name, stack in self.observe_all([episode]).items()}
+        return {name: arrays[0] for name, arrays in self.observe_all([episode]).items()}
 
     def observe_all(self, episodes: Sequence[InView]) -> Arrays:
         """Returns the current observations of N episodes, [N, ...], as `observe` returns each."""

@@ -21,7 +21,7 @@ from flowrep.scenes.scene import Range, Scene, num_classes
 from flowrep.scenes.vehicle import YAW_SIGN
 from flowrep.transforms import Mirror, representation_stack
 from flowrep.transforms.base import as_keys
-from flowrep.transforms.stack import FLOWS, DropKeys, Representations
+from flowrep.transforms.representations import FLOWS, DropKeys, Representations
 
 
 def usable_device(device: str | torch.device) -> torch.device:

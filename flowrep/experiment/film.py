@@ -19,7 +19,12 @@ from flowrep.experiment.evaluation import Driver, evaluate
 from flowrep.experiment.outcomes import EpisodeRecord
 from flowrep.experiment.schema import EnvConfig
 from flowrep.transforms import representation_stack
-from flowrep.transforms.stack import FLOWS, FRAMES_OF, REPRESENTATIONS, representation_options
+from flowrep.transforms.representations import (
+    FLOWS,
+    FRAMES_OF,
+    REPRESENTATIONS,
+    representation_options,
+)
 from flowrep.viz import (
     OUTCOME_COLOURS,
     Image,

@@ -248,7 +248,7 @@ def _env_config(given: Mapping[str, Any]) -> EnvConfig:
 
 def _whole_options(name: str) -> dict[str, Any]:
     """Returns a representation's options with their defaults, none for one of the user's."""
-    from flowrep.transforms.stack import REPRESENTATIONS, representation_options
+    from flowrep.transforms.representations import REPRESENTATIONS, representation_options
 
     return representation_options(name) if name in REPRESENTATIONS else {}
 

@@ -32,7 +32,7 @@ _shading = compiled(error_model="numpy", fastmath=True)
 _inlined = compiled(error_model="numpy", fastmath=True, inline="always")
 
 
-class Maps(NamedTuple):
+class Rendered(NamedTuple):
     """Maps of N views [N, H, W]; a pixel without a surface has depth inf, class 0, instance 0."""
 
     depth: NDArray[np.float32]  # metres along z
@@ -72,7 +72,7 @@ class Rasteriser:
         is_shown: NDArray[np.bool_],  # [N, B]
         *,
         rgb: bool = False,
-    ) -> Maps:
+    ) -> Rendered:
         """Returns N views of the same bodies, each with its own poses."""
         # Tables of 4 MB are made when colours are first drawn.
         look = *self._look, *((paint.grain(), paint.front_levels()) if rgb else _NO_TABLES)
@@ -80,7 +80,7 @@ class Rasteriser:
         depth = np.empty((views, *self._size), np.float32)
         semantic, instance = (np.empty(depth.shape, np.uint8) for _ in range(2))
         colours = np.empty((views if rgb else 0, 3, *self._size), np.uint8)
-        maps = Maps(depth, semantic, instance, colours)
+        maps = Rendered(depth, semantic, instance, colours)
         _draw(*self._world, look, cam_from_world, world_from_body, is_shown, *maps)
         return maps
 
@@ -91,7 +91,7 @@ def _draw(
     K, near_m, far_m, look, cam_from_world, world_from_body, is_shown,
     depth, semantic, instance, rgb,
 ):  # fmt: skip
-    # `Triangles`, `Rasteriser.__call__` and `Maps` describe the arrays and their shapes. `inverse`
+    # `Triangles`, `Rasteriser.__call__` and `Rendered` describe the arrays and shapes. `inverse`
     # [H, W] is a z-buffer of inverse depths (larger is nearer), which starts at the far plane.
     # `number` [H, W] is the triangle that a pixel shows, at first -1, the sky. Each triangle takes
     # the pixels where it is nearer. Ids and colours are looked up once, after all triangles.

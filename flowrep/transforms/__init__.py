@@ -20,8 +20,12 @@ from flowrep.transforms.motion import (
     PreviousIntrinsics,
 )
 from flowrep.transforms.noise import SensorNoise
+from flowrep.transforms.representations import (
+    REPRESENTATIONS,
+    representation_options,
+    representation_stack,
+)
 from flowrep.transforms.simulators import CONVENTIONS, Convention, sensors_from
-from flowrep.transforms.stack import REPRESENTATIONS, representation_options, representation_stack
 
 __all__ = [
     "CONVENTIONS", "DIS", "RAFT", "REPRESENTATIONS", "AdaptDepth", "AdaptFlow", "AdaptPose",

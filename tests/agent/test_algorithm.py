@@ -12,7 +12,8 @@ from torchrl.data import Categorical, OneHot
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from flowrep.agent import load_checkpoint, save_checkpoint, torch_threads
-from flowrep.agent.algorithm import DivergenceError, DivergenceWatch, with_fixed_layout
+from flowrep.agent.cuda_graph import with_fixed_layout
+from flowrep.agent.divergence import DivergenceError, DivergenceWatch
 from tests.running import run_python
 
 ENVS = 5

@@ -16,7 +16,7 @@ from torchrl.envs.transforms import Compose, FrameSkipTransform, NoopResetEnv, T
 
 from flowrep import transforms as T
 from flowrep.geometry import ego_flow
-from flowrep.transforms.stack import DropKeys
+from flowrep.transforms.representations import DropKeys
 from tests.transforms.fake_env import (
     INTRINSICS,
     FakeSensorEnv,
