@@ -14,6 +14,7 @@ from tensordict.nn import dispatch
 from tensordict.utils import NestedKey, expand_as_right
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
+from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, Transform
 
 # One key (a string, or a tuple of strings if nested) or a list of keys, as in TorchRL.
@@ -192,8 +193,8 @@ class MapTransform(Transform):
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         # Loops that read no specs don't call `transform_input_spec`.
-        if not torch.compiler.is_compiling() and _is_in_env(self):
-            self._check_steps(self._of_its_env())
+        if not torch.compiler.is_compiling() and isinstance(_outermost(self), EnvBase):
+            self._check_steps(self._beside())
         # TorchRL's `_reset` doesn't call the transform.
         begins = tensordict.get("_reset", None)
         rows = None
@@ -241,12 +242,14 @@ class MapTransform(Transform):
         """Returns the specs unchanged; refuses what the env steps over, see `Raises`."""
         input_spec = super().transform_input_spec(input_spec)
         if self.container is not None:
-            self._check_steps(self._of_its_env())
+            self._check_steps(self._beside())
         return input_spec
 
-    def _of_its_env(self) -> list[Any]:
-        """Returns all transforms of the env, in their order."""
-        waiting, flat = [getattr(self.container, "transform", self)], []
+    def _beside(self) -> list[Any]:
+        """Returns all transforms of its env or of its outermost Compose, in their order."""
+        outermost = _outermost(self)
+        is_env, flat = isinstance(outermost, EnvBase), []
+        waiting = [outermost.transform if is_env else outermost]
         while waiting:
             transform = waiting.pop(0)
             if isinstance(transform, Compose):
@@ -278,12 +281,12 @@ class MapTransform(Transform):
         return f"{type(self).__name__}({self.in_keys} -> {self.out_keys})"
 
 
-def _is_in_env(transform: Any) -> bool:
+def _outermost(transform: Any) -> Any:
+    """Returns the env that holds a transform or, without one, its outermost Compose."""
     # `container` raises in a Compose that is in no env, as gymnasium's wrapper has one.
-    while isinstance(transform, Transform):
-        held = transform.__dict__["_container"]
-        transform = held and held()
-    return transform is not None
+    while (held := transform.__dict__.get("_container")) and (holder := held()) is not None:
+        transform = holder
+    return transform
 
 
 class RecurrentTransform(MapTransform):

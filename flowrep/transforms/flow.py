@@ -281,8 +281,20 @@ class RawFlow(FlowTransform):
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
         """Returns the outputs' specs; ValueError unless ids' spec has a number for each motion."""
         _, ids, motions, *_ = specs
-        bodies, rows = _highest_id(ids), motions.shape[-3]
-        if rows > 1 and bodies != rows - 1:  # without bodies, an id is wrong or the static world's
+        if motions.shape[-3] > 1:  # without bodies, an id is wrong or the static world's
+            self._check_rows(_highest_id(ids), motions)
+        return super().output_specs(*specs)
+
+    def _check_values(self, tensordict: TensorDictBase, *, waits: bool = False) -> None:
+        super()._check_values(tensordict, waits=waits)
+        # A batch has no specs, but may have an InstanceIds beside it.
+        _, ids, motions, *_ = self.in_keys
+        for each in self._beside():
+            if ids in each.out_keys and hasattr(each, "body_ids") and motions in tensordict:
+                self._check_rows(len(each.body_ids), tensordict[motions])
+
+    def _check_rows(self, bodies: int | None, motions: Tensor | TensorSpec) -> None:
+        if bodies != (rows := motions.shape[-3]) - 1:
             found = "has a spec of any id" if bodies is None else f"has ids from 0 to {bodies}"
             raise ValueError(
                 f"{self.in_keys[1]!r} {found}, and {self.in_keys[2]!r} has {rows} rows: that must "
@@ -290,7 +302,6 @@ class RawFlow(FlowTransform):
                 "(Poses are N, of bodies alone: InstanceMotion adds the static world's row.) "
                 "InstanceIds, with one id for each pose in their order, declares its ids"
             )
-        return super().output_specs(*specs)
 
 
 class FlowFactorize(FlowTransform):

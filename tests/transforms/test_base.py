@@ -11,7 +11,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Composite, Unbounded
-from torchrl.envs import TransformedEnv
+from torchrl.envs import SerialEnv, TransformedEnv
 from torchrl.envs.transforms import Compose, FrameSkipTransform, NoopResetEnv, Transform
 
 from flowrep import transforms as T
@@ -190,11 +190,21 @@ def test_the_motion_of_the_envs_last_step_is_refused_where_others_step_it(make, 
         TransformedEnv(FakeSensorEnv(), Compose(*parts)).reset()  # as a loop that reads no specs
 
 
-@pytest.mark.parametrize("is_first", [True, False])
-def test_poses_give_the_flow_between_two_observations_though_a_frame_lies_between(is_first):
-    skip = FrameSkipTransform(2)
-    parts = [skip, *by_poses()] if is_first else [*by_poses(), skip]
-    seen = TransformedEnv(FakeSensorEnv(), Compose(*parts)).rollout(1)["next"]
+def flow_in_worker() -> TransformedEnv:
+    return TransformedEnv(FakeSensorEnv(), Compose(*by_poses()))
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda skip: TransformedEnv(FakeSensorEnv(), Compose(skip, *by_poses())),
+        lambda skip: TransformedEnv(FakeSensorEnv(), Compose(*by_poses(), skip)),
+        lambda skip: TransformedEnv(SerialEnv(1, flow_in_worker), skip),
+    ],
+    ids=["first", "last", "outside of the worker"],
+)
+def test_poses_give_the_flow_between_two_observations_though_a_frame_lies_between(make):
+    seen = make(FrameSkipTransform(2)).rollout(1)["next"].squeeze(0)
     once = camera_motion(1, 0)
     want = ego_flow(seen["sensor", "depth"], torch.tensor(INTRINSICS), once @ camera_motion(2, 0))
     torch.testing.assert_close(seen["ego"], want.flow, atol=1e-4, rtol=1e-4)
