@@ -170,13 +170,12 @@ def test_the_planner_succeeds_where_never_turning_and_random_actions_fail(drive,
 def test_the_kerb_is_on_the_sidewalk_and_paving_is_below_it(name):
     layout = Layout(load_scene(name))
     stones = kerb(layout.drivable, layout.sidewalks)
-    corners = np.array(stones.vertices)[stones.indices].reshape(-1, 3, 3)
-    stone = shapely.union_all(shapely.polygons(corners[:, :, :2]))
+    stone = shapely.union_all(shapely.polygons(stones.corners[:, :, :2]))
     assert stone.difference(layout.sidewalks.buffer(1e-6)).area == 0
     # A quarter of a metre all along the road, where there is a sidewalk.
     along = layout.drivable.boundary.intersection(layout.sidewalks.buffer(1e-6)).length
     assert stone.area == pytest.approx(0.25 * along, rel=0.02)
-    assert (corners[..., 2] > 0).all()  # or it would flicker with the paving
+    assert (stones.corners[..., 2] > 0).all()  # or it would flicker with the paving
 
 
 def test_lane_marks_stop_where_crosswalks_and_other_roads_are():
@@ -186,7 +185,7 @@ def test_lane_marks_stop_where_crosswalks_and_other_roads_are():
     marks = lane_marks(
         layout.lines["bar"], shapely.union_all([west, layout.ribbons["east"], striped])
     )
-    points = shapely.points(np.array(marks.vertices)[:, :2])
+    points = shapely.points(marks.corners.reshape(-1, 3)[:, :2])
     # 70 m of bar less half a leg at either end and the crosswalk: ten dashes, six metres apart.
     assert len(points) > 30
     assert not shapely.intersects(points, striped).any()
