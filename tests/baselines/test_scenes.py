@@ -6,7 +6,6 @@ Counts are small here; `examples/scene_validity.py` runs hundreds of episodes a 
 from dataclasses import replace
 
 import gymnasium
-import numpy as np
 import pytest
 import shapely
 from gymnasium.utils.env_checker import check_env
