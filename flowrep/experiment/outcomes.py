@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from rich import box
 from rich.console import Console
@@ -30,16 +30,10 @@ OUTCOMES = ("success", "collision", "out_of_bounds", "timeout")
 CAUSES = ("out of bounds", "collision: pedestrian", "collision: other", "timeout")
 
 
-class EpisodeKey(NamedTuple):
-    """The columns that tell a run's episodes apart; older tables need `scene`, too."""
-
-    scene_id: str
-    evaluation: str
-    frames: int
-    policy: str
-    speed: str
-    fps: float
-    episode_seed: int
+IDENTITY = (
+    "scene", "scene_id", "evaluation", "frames", "policy", "speed", "fps", "episode_seed",
+)  # fmt: skip
+"""The columns that tell a run's episodes apart."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,34 +62,31 @@ class EpisodeRecord:
     # The vehicle's x and y in metres, `[T + 1, 2]`.
     positions: NDArray[np.float32] = field(repr=False, compare=False)
 
-    @property
-    def key(self) -> EpisodeKey:
-        """What tells it apart from the run's other episodes."""
-        return EpisodeKey(*(getattr(self, name) for name in EpisodeKey._fields))
-
     def row(self) -> dict[str, Any]:
         """Returns the episode's row in evaluation.csv, by column."""
-        row = {column: getattr(self, name) for column, name in _FIELDS.items()}
+        # A field can't be named `return`.
+        row = {name: getattr(self, "return_" if name == "return" else name) for name in COLUMNS}
         return row | {"return": round(self.return_, 4)}
 
 
-# A field can't be named `return`.
-_FIELDS = {each.name.rstrip("_"): each.name for each in fields(EpisodeRecord)[:-1]}
-EVALUATION_COLUMNS = tuple(_FIELDS)
-
+COLUMNS: dict[str, type] = {
+    each.name.rstrip("_"): {"int": int, "float": float}.get(str(each.type), str)
+    for each in fields(EpisodeRecord)[:-1]
+}
+"""The columns of evaluation.csv in their order, and the types of their cells."""
 _LATER = ("scene_id", "path")  # columns that older tables lack; they are read as empty
-_CHECKS: dict[str, Callable[[str], Any]] = {
-    "frames": whole_number, "fps": finite_number, "episode_seed": whole_number,
-    "length": whole_number, "outcome": OUTCOMES.index,
-}  # fmt: skip
-"""How cells of evaluation.csv are checked: a misspelt outcome would count as a failure."""
+_OF_TYPE: dict[type, Callable[[str], Any]] = {int: whole_number, float: finite_number}
+# A misspelt outcome would count as a failure.
+_CHECKS = {name: _OF_TYPE[kind] for name, kind in COLUMNS.items() if kind is not str} | {
+    "outcome": OUTCOMES.index
+}
 
 
 def read_episodes(path: Path) -> list[dict[str, str]]:
     """Returns the rows of an evaluation.csv, none if there is no such file."""
-    needed = [name for name in EVALUATION_COLUMNS if name not in _LATER]
+    needed = [name for name in COLUMNS if name not in _LATER]
     rows = read_rows(path, needed, _CHECKS)
-    return [{name: row.get(name, "") for name in EVALUATION_COLUMNS} for row in rows]
+    return [{name: row.get(name, "") for name in COLUMNS} for row in rows]
 
 
 def is_finished(folder: Path, config: TrainConfig) -> bool:

@@ -22,9 +22,9 @@ from filelock import FileLock, Timeout
 from flowrep.config.usage import UsageError
 from flowrep.config.yaml_file import read_yaml
 from flowrep.experiment.outcomes import (
-    EVALUATION_COLUMNS,
+    COLUMNS,
+    IDENTITY,
     OUTCOMES,
-    EpisodeKey,
     EpisodeRecord,
     read_episodes,
 )
@@ -244,8 +244,8 @@ class RunFolder:
 
         They go to the end, so that running the same evaluation again results in the same file.
         """
-        identity = itemgetter("scene", *EpisodeKey._fields)
+        identity = itemgetter(*IDENTITY)
         new = [{name: str(cell) for name, cell in each.row().items()} for each in records]
         again = {identity(row) for row in new}
         kept = [row for row in self.read_episodes() if identity(row) not in again]
-        write_rows(self.evaluation_path, [*kept, *new], EVALUATION_COLUMNS)
+        write_rows(self.evaluation_path, [*kept, *new], COLUMNS)

@@ -1,7 +1,7 @@
 """Runs for a report, read from folders: which may be compared, and the success of episodes."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property, reduce
 from itertools import product
 from pathlib import Path
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrep.config.options import SpeedMode
-from flowrep.experiment.outcomes import EVALUATION_COLUMNS, EpisodeRecord
+from flowrep.experiment.outcomes import COLUMNS
 from flowrep.experiment.provenance import flattened, origin_of
 from flowrep.experiment.run import RunFolder, RunFolderError
 from flowrep.files import TableError
@@ -35,13 +35,11 @@ STACKS = tuple(dict.fromkeys(FLOW_STACKS + COMPLEMENTARY_STACKS))
 DRAWN_BASELINES = ("never_turn", "random", "planner", "speed_blind")
 _REPRESENTATIONS = ("raw", "ego", "obj", "seg", "seg2", "depth", "depth2", "rgb")
 _SHARED_SCENE_KEYS = ("camera", "frame_rate_hz")  # keys whose values are the same in all scenes
-_TYPES: dict[Any, type] = {"int": int, "float": float, "str": str}
 # Columns of evaluation.csv that don't follow from the run's config and the outcome.
 EPISODE_COLUMNS = {
-    each.name: _TYPES[each.type]
-    for each in fields(EpisodeRecord)
-    if each.name in EVALUATION_COLUMNS
-    and each.name not in ("representations", "flow", "seed", "return")
+    name: kind
+    for name, kind in COLUMNS.items()
+    if name not in ("representations", "flow", "seed", "return")
 }
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from flowrep.experiment.outcomes import (
     CAUSES,
-    EVALUATION_COLUMNS,
+    COLUMNS,
     OUTCOMES,
     failure_causes,
     outcome_shares,
@@ -33,7 +33,7 @@ def test_a_record_has_a_cell_for_each_column_of_the_table():
         "scene", "scene_id", "representations", "flow", "seed", "frames", "evaluation", "policy",
         "speed", "fps", "episode_seed", "path", "outcome", "hit", "return", "length",
     ]  # fmt: skip
-    assert tuple(row) == EVALUATION_COLUMNS
+    assert [*row] == [*COLUMNS]
     assert (row["episode_seed"], row["path"], row["outcome"]) == (7, "left", "timeout")
     assert row["return"] == -4.3
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from flowrep.experiment.outcomes import EVALUATION_COLUMNS, EpisodeRecord
+from flowrep.experiment.outcomes import COLUMNS, EpisodeRecord
 from flowrep.experiment.provenance import machine_of
 from flowrep.experiment.run import FolderInUseError, RunFolder, RunFolderError
 from flowrep.files import TableError, write_rows
@@ -191,7 +191,7 @@ def test_an_evaluation_run_again_leaves_the_table_of_one_that_was_never_stopped(
     assert {row["outcome"] for row in run.read_episodes()} == {"collision"}
 
 
-HEADER = ",".join(EVALUATION_COLUMNS)
+HEADER = ",".join(COLUMNS)
 ROW = ",".join(cells(episode(1)).values())
 DAMAGED = {
     "no number": f"{HEADER}\n{','.join(cells(episode(1), frames='1O').values())}\n",

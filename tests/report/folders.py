@@ -2,7 +2,7 @@
 
 import yaml
 
-from flowrep.experiment.outcomes import EVALUATION_COLUMNS
+from flowrep.experiment.outcomes import COLUMNS
 from flowrep.files import write_rows
 
 EPISODES = 8
@@ -56,6 +56,7 @@ def rows_of(config, outcomes, *, speed="normal", fps=12.0, policy="greedy", **ch
             "episode_seed": 100 + k,
             "outcome": names[letter],
             "hit": "pedestrian" if letter == "c" else "",
+            "return": 1.0,
             "length": 150,
         }
         | changes
@@ -67,7 +68,7 @@ def write_run(path, config, rows, metrics=()):
     """Writes a run's folder."""
     path.mkdir(parents=True)
     (path / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
-    write_rows(path / "evaluation.csv", rows, EVALUATION_COLUMNS)
+    write_rows(path / "evaluation.csv", rows, COLUMNS)
     write_rows(path / "metrics.csv", metrics)
     return path
 
