@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import ctypes
 import json
-import math
 import multiprocessing
 import os
 import re
@@ -52,20 +51,6 @@ POLL_S = 0.5
 # A process whose parent ends gets another one: so a worker notices that its launcher was killed.
 PARENT = os.getppid()
 BEGUN, FINISHED, FAILED, STOPPED = "begun", "finished", "failed", "stopped"
-_NEEDED_BY = {
-    # Finished jobs take no time, so batches would grow and delay the unfinished ones.
-    "hydra/launcher=joblib": ("hydra.launcher.batch_size=1",),
-    # A run returns its success, and a failed run should not end the study.
-    "hydra/sweeper=optuna": (
-        "hydra.sweeper.direction=maximize",
-        "hydra.sweeper.max_failure_rate=1.0",
-    ),
-}
-"""Options that a sweep with these plugins needs; they are added unless they are typed."""
-
-
-class RunFailedError(RuntimeError):
-    """A run of a sweep has no result."""
 
 
 def is_sweep(arguments: list[str]) -> bool:
@@ -75,8 +60,7 @@ def is_sweep(arguments: list[str]) -> bool:
 
 def run_sweep() -> NoReturn:
     """Runs the sweep of `sys.argv`, prints how its runs ended, and ends the process."""
-    keys = {text.partition("=")[0] for text in sys.argv[1:]}
-    if "resume" in keys:
+    if any(text.startswith("resume=") for text in sys.argv[1:]):
         cli.exit_with(
             "resume= continues one run; to continue a sweep, repeat its command with "
             "hydra.sweep.dir=<its folder>"
@@ -86,12 +70,10 @@ def run_sweep() -> NoReturn:
     new = f"outputs/{datetime.now():%Y-%m-%d/%H-%M-%S}_sweep"
     folder = Path(folders[-1] if folders else new).absolute()
     given = cli.override("hydra.sweep.dir", str(folder))
-    needed = [option for choice in typed for option in _NEEDED_BY.get(choice, ())]
-    needed = [option for option in needed if option.partition("=")[0] not in keys]
     # argparse needs all overrides side by side, and flags with values may surround them.
     are_keys = ["=" in text and not text.startswith("-") for text in typed]
     at = are_keys.index(True) if True in are_keys else len(typed)
-    sys.argv[1:] = [*typed[:at], given, *needed, *typed[at:]]
+    sys.argv[1:] = [*typed[:at], given, *typed[at:]]
 
     def mark() -> None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -130,11 +112,8 @@ def state_of(log: Path) -> str:
     return last.removeprefix("--- ") if has_ended else STOPPED
 
 
-def job(config: DictConfig) -> float:
-    """Runs what remains of one run in a separate process; called by Hydra's launchers.
-
-    Returns its final success; nan if a run of a grid has none, so that the others go on.
-    """
+def job(config: DictConfig) -> None:
+    """Runs what remains of one run in a separate process; called by Hydra's launchers."""
     hydra = HydraConfig.get()
     folder, stopped = Path(hydra.runtime.output_dir), Path(hydra.sweep.dir) / STOP
     is_worker = multiprocessing.current_process().name != "MainProcess"  # of a pool, as joblib's
@@ -156,11 +135,6 @@ def job(config: DictConfig) -> float:
             state = f"{FAILED}: error: {' '.join(str(error).split())}"
         log.write(f"--- {state}\n".encode())
     print(f"{folder.name}: {state}", flush=True)
-    if state.startswith(FINISHED):
-        return success_of(folder)
-    if hydra.sweeper["_target_"].endswith("BasicSweeper"):
-        return math.nan
-    raise RunFailedError(f"{folder} {state}")
 
 
 def attempted(

@@ -25,7 +25,7 @@ from flowrep.config.cli import checked, end_with, exit_with, line_for, run_comma
 from flowrep.config.folders import OF_THE_MACHINE, settings_of
 from flowrep.config.options import validated
 from flowrep.config.usage import UsageError
-from flowrep.experiment.outcomes import is_finished, success_of
+from flowrep.experiment.outcomes import is_finished
 from flowrep.experiment.schema import TrainConfig
 from flowrep.progress import StopRequest
 
@@ -51,11 +51,8 @@ class EarlyCheck(Callback):
             end_with(error)
 
 
-def run(config: TrainConfig) -> float:
-    """Trains, evaluates and films one agent, or continues a run with `resume=`.
-
-    Returns its final success, which a sweeper such as Optuna maximises.
-    """
+def run(config: TrainConfig) -> None:
+    """Trains, evaluates and films one agent, or continues a run with `resume=`."""
     from flowrep.experiment.run import RunFolder
 
     job = HydraConfig.get()
@@ -63,12 +60,13 @@ def run(config: TrainConfig) -> float:
     if config.resume is not None:
         folder = RunFolder.existing(config.resume)
         with folder.held(PATIENCE_S):
-            return run_in_folder(resumed(config, folder, typed), folder)
+            run_in_folder(resumed(config, folder, typed), folder)
+        return
     folder = RunFolder(job.runtime.output_dir)
     with folder.held():
         folder.check_is_new()
         announce(config, settings_of(job.runtime.choices))
-        return run_in_folder(config, folder, typed)
+        run_in_folder(config, folder, typed)
 
 
 def run_sweep_job() -> None:
@@ -145,8 +143,8 @@ def announce(config: TrainConfig, settings: str) -> None:
         )
 
 
-def run_in_folder(config: TrainConfig, folder: RunFolder, typed: Iterable[str] = ()) -> float:
-    """Runs what remains of a run (training, evaluation, video) and returns its success.
+def run_in_folder(config: TrainConfig, folder: RunFolder, typed: Iterable[str] = ()) -> None:
+    """Runs what remains of a run: training, evaluation, film.
 
     Its config is written once everything could be built: what fails before leaves no run behind.
     """
@@ -176,7 +174,6 @@ def run_in_folder(config: TrainConfig, folder: RunFolder, typed: Iterable[str] =
         print(f"\nstopped after {runner.frames} frames; the run is saved. Continue with")
         print(f"  {how_to_go_on}")
         sys.exit(stop.exit_code)
-    return success_of(folder.path)
 
 
 def train_evaluate_film(runner: Runner, stop: StopRequest) -> bool:

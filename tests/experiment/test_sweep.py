@@ -13,7 +13,7 @@ import yaml
 from flowrep import sweep
 from flowrep.config import cli, group_choices
 from flowrep.config.usage import UsageError
-from flowrep.experiment.outcomes import EVALUATION_COLUMNS, is_finished
+from flowrep.experiment.outcomes import COLUMNS, is_finished
 from flowrep.experiment.schema import TrainConfig
 from flowrep.files import open_to_append, read_rows, write_rows
 from tests.config.composing import composed, plain
@@ -31,9 +31,9 @@ CONFIG = composed("debug=smoke", "evaluation.final_episodes=1", "evaluation.spee
 
 def write_final_evaluation(folder, *ends):
     rows = [
-        dict.fromkeys(EVALUATION_COLUMNS, "")
+        dict.fromkeys(COLUMNS, "")
         | {"evaluation": "final", "frames": 256, "policy": policy, "outcome": end}
-        | {"fps": 12.0, "episode_seed": 1, "length": 9}
+        | {"fps": 12.0, "episode_seed": 1, "return": 1.0, "length": 9}
         for policy, end in zip(("greedy", "sampled", "a", "b"), ends)
     ]
     write_rows(folder / "evaluation.csv", rows)
