@@ -9,7 +9,6 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -104,7 +103,7 @@ def evaluate_one(
     evaluations: dict[str, PairedEvaluation],
     stop: StopRequest,
 ) -> None:
-    """Runs an agent's episodes, keeps whole groups even if interrupted, and films some."""
+    """Runs an agent's episodes, keeps whole groups even if interrupted."""
     from flowrep.experiment import build
     from flowrep.experiment.evaluation import PairedEvaluation
     from flowrep.experiment.outcomes import print_results
@@ -115,7 +114,8 @@ def evaluate_one(
         build.share_cores(agent.config)
     origin = agent.origin("evaluate")
     # Agents of one scene share the baselines' episodes.
-    episodes = config.speed, frame_rates(config, agent), config.episodes, config.seed
+    rates = config.fps or [agent.config.scene.frame_rate_hz]
+    episodes = config.speed, rates, config.episodes, config.seed
     evaluation = evaluations.setdefault(
         f"{origin['scene_id']} {candidate.policies}",
         PairedEvaluation(*episodes, candidate.policies, config.baselines),
@@ -143,28 +143,6 @@ def evaluate_one(
                 "not saved, because short episodes end first and would bias them. The same command "
                 "runs them again"
             )
-    film(config, agent, folder, stop)
-
-
-def frame_rates(config: EvaluateConfig, agent: Agent) -> list[float]:
-    """Returns the frame rates that are asked for, by default that of the agent's scene."""
-    return config.fps or [agent.config.scene.frame_rate_hz]
-
-
-def film(config: EvaluateConfig, agent: Agent, folder: RunFolder, stop: StopRequest) -> None:
-    """Writes `video` episodes for each speed and frame rate, until a stop is asked for."""
-    from flowrep.experiment.film import record_episode
-
-    name = agent.config.scene.name
-    where = "" if agent.trained_in and agent.trained_in.name == name else f"{name}_"
-    rates = frame_rates(config, agent)
-    for speed, rate, number in product(config.speed, rates, range(config.video)):
-        if stop:
-            return
-        seed = config.seed + number
-        path = folder.video_path(f"{where}{speed}_{rate:g}fps_{seed}")
-        record_episode(agent, path, episode_seed=seed, speed=speed, frame_rate_hz=float(rate))
-        print(f"video: {path}")
 
 
 def main() -> None:

@@ -5,7 +5,6 @@ import signal
 from contextlib import closing, nullcontext
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -63,8 +62,7 @@ def untouched(run):
     config = (run.path / "config.yaml").read_bytes()
     yield run
     (run.path / "config.yaml").write_bytes(config)
-    for name in ("evaluation.csv", "drives.npz"):
-        (run.path / name).unlink(missing_ok=True)
+    run.evaluation_path.unlink(missing_ok=True)
 
 
 def test_evaluated_again_the_table_is_the_same_byte_for_byte(untouched):
@@ -75,10 +73,6 @@ def test_evaluated_again_the_table_is_the_same_byte_for_byte(untouched):
     assert untouched.evaluation_path.read_bytes() == before
     rows = untouched.read_episodes()
     assert {row["evaluation"] for row in rows} == {"evaluate"}
-    with np.load(untouched.path / "drives.npz") as drives:
-        assert drives["policy"].tolist() == [row["policy"] for row in rows]
-        lengths = np.diff(drives["starts"]) - 1
-        assert lengths.tolist() == [int(row["length"]) for row in rows]
 
 
 def test_an_agent_drives_at_the_frame_rate_of_its_scene_unless_another_is_given(tmp_path):
@@ -100,14 +94,11 @@ def test_an_agent_drives_in_another_scene_and_changed_scenes_are_told_apart(unto
     evaluate(asked(here, "scene=s_turn", "baselines=[never_turn]"))
     assert [row["scene"] for row in untouched.read_episodes()] == ["s_turn"] * 4
     evaluate(asked(here, "scene=straight_road", "scene.time_limit_steps=3"))
-    evaluate(asked(here, "scene=straight_road", "scene.time_limit_steps=4", "video=1"))
+    evaluate(asked(here, "scene=straight_road", "scene.time_limit_steps=4"))
     rows = untouched.read_episodes()[4:]
     assert [row["scene"] for row in rows] == ["straight_road"] * 4
     assert len({row["scene_id"] for row in rows}) == 2
     assert {row["length"] for row in rows} == {"3", "4"}
-    assert [film.name for film in (untouched.path / "videos").iterdir()] == [
-        "normal_12fps_2000000.mp4"
-    ]
 
 
 def test_an_agent_that_reads_classes_drives_wherever_it_knows_them_all(tmp_path):
@@ -263,11 +254,10 @@ def test_an_evaluation_that_was_stopped_keeps_whole_groups_and_leaves_no_trace_o
     driver.at, driver.act = driver.steps + STEPS_OF_A_GROUP, signal_all
     again = config.model_copy(update={"run": [str(folder.path)]})
     with pytest.raises(SystemExit) as ended:
-        evaluate(again.model_copy(update={"num_workers": num_workers, "video": 1}))
+        evaluate(again.model_copy(update={"num_workers": num_workers}))
     assert len(worker_processes) == num_workers
     assert ended.value.code == 128 + number
     assert folder.read_episodes() == of_low_speed(rows)
-    assert not (folder.path / "videos").exists()
     evaluate(again)
     assert folder.evaluation_path.read_bytes() == whole.evaluation_path.read_bytes()
 
@@ -282,21 +272,6 @@ def test_a_worker_that_is_killed_is_named_and_what_ended_before_is_kept(
     rows = folder.read_episodes()
     assert len(rows) == 8
     assert rows == of_low_speed(rows)
-
-
-def test_a_stop_ends_between_two_films(some, monkeypatch):
-    filmed = []
-
-    def record(agent, path, **_):
-        filmed.append(path.name)
-        signal.raise_signal(signal.SIGTERM)  # as schedulers send it
-
-    monkeypatch.setattr("flowrep.experiment.film.record_episode", record)
-    _, config = some("good", overrides=["video=2", "seed=7", "episodes=1"])
-    with pytest.raises(SystemExit) as ended:
-        evaluate(config)
-    assert ended.value.code == 128 + signal.SIGTERM
-    assert filmed == ["normal_12fps_7.mp4"]
 
 
 # Policies of the user's own, and exported agents.

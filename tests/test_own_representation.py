@@ -154,5 +154,5 @@ def test_from_the_command_line(folder):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     evaluate = "run=run", "episodes=1", "speed=low", "baselines=[]", "num_workers=0", "device=cpu"
-    done = run("evaluate", *evaluate, "num_envs=1", "video=1", TYPED)
+    done = run("evaluate", *evaluate, "num_envs=1", TYPED)
     assert done.returncode == 0, done.stderr

@@ -203,7 +203,6 @@ class EvaluateConfig(Command):
     num_envs: Count
     num_workers: Workers
     device: Device
-    video: CountOrZero
 
     @property
     def other_policies(self) -> list[str]:
