@@ -18,7 +18,6 @@ require(
     module=__name__,
 )  # fmt: skip
 
-from hydra.core.hydra_config import HydraConfig
 from pydantic import ConfigDict, Field, model_validator
 
 from flowrep.config.cli import run_command
@@ -77,7 +76,6 @@ class FactorizeConfig(Command):
     pictures_every: CountOrZero
     video: bool
     video_fps: Positive
-    rerun: bool
     scale_px: FlowScale
     depth_range_m: Positive
 
@@ -116,7 +114,6 @@ def factorize_recording(config: FactorizeConfig) -> int:
         moving_px=config.moving_px,
         masks=config.masks,
         video_fps=config.video_fps if config.video else None,
-        rerun=config.rerun,
     )
     start, stop, stride = config.start, config.stop, config.stride
     with closing(output):
@@ -143,11 +140,8 @@ def open_stream(config: FactorizeConfig) -> sequences.Stream:
     """Returns the recording or camera that `input` and `format` name."""
     from flowrep.sequences.formats import open_reader
 
-    typed = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
-    keys = [text.lstrip("+").partition("=")[0] for text in typed]
-    given = [key.removeprefix("format.") for key in keys if key.startswith("format.")]
-    reader, options = config.format.target, config.format.options()
-    stream: sequences.Stream = open_reader(reader, str(config.input), options, given)
+    options = config.format.options()
+    stream: sequences.Stream = open_reader(config.format.target, str(config.input), options)
     return stream
 
 

@@ -105,22 +105,6 @@ def test_all_that_is_written(moments, tmp_path):
     assert (summary["frames"], summary["suspects"]) == (2, [])
 
 
-def test_a_rerun_recording_holds_the_camera_pictures_and_flow(moments, tmp_path):
-    pytest.importorskip("rerun", reason="rerun-sdk is not installed")
-    _, out = factorize(tmp_path, "flow=exact", "video=false", "rerun=true")
-    data = (out / "scene.rrd").read_bytes()
-    assert data.startswith(b"RRF")
-    for place in (b"/world/camera/image/depth", b"/world/camera/image/rgb", b"/flow/obj"):
-        assert place in data
-
-
-def test_without_rerun_the_package_is_named_and_nothing_is_left(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(ImportError, match=r"rerun.*pip install"):
-        Output(tmp_path / "out", {}, rerun=True)
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_wrong_convention_ends_the_job_if_asked_and_else_is_a_warning(moments, tmp_path, capsys):
     wrong = ["format.pose_direction=world_to_camera", "video=false", "flow_files=[]"]
     wrong += ["flow=exact", "pictures_every=0"]

@@ -4,7 +4,7 @@ from flowrep.extras import require
 
 require("flowrep.sequences", "factorize", "cv2", "pydantic")
 
-from flowrep.sequences.calibration import Registration, Undistortion
+from flowrep.sequences.calibration import Registration
 from flowrep.sequences.declared import DeclaredRecording
 from flowrep.sequences.factorization import (
     EstimatedFlowSource,
@@ -25,7 +25,7 @@ from flowrep.sequences.video import StillVideo
 
 __all__ = [
     "DeclaredRecording", "EstimatedFlowSource", "FactorizedFrame", "Frame", "Kitti", "Motion",
-    "Recording", "Registration", "RosBag", "SequenceError", "StillVideo", "Stream", "Undistortion",
+    "Recording", "Registration", "RosBag", "SequenceError", "StillVideo", "Stream",
     "estimated_motion", "factorize_frames", "factorize_pair", "open_recording", "read_flow",
     "recorded_flow", "recorded_motion", "write_flo", "write_kitti_flow",
 ]  # fmt: skip

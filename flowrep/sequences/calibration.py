@@ -23,6 +23,7 @@ from flowrep.sequences.recording import Pose, SequenceError
 
 Matrix: TypeAlias = NDArray[np.float64]
 Lens: TypeAlias = Literal["opencv", "fisheye"]
+IntrinsicsKind: TypeAlias = Literal["pixels", "cam_from_uv"]
 
 
 class Camera(pydantic.BaseModel):
@@ -145,12 +146,15 @@ def camera_matrix(
     size: tuple[int, ...],
     first_pixel_centre: float,
     source: object = "intrinsics",
+    kind: IntrinsicsKind = "pixels",
 ) -> Matrix:
     """Returns K `[3, 3]` in flowrep's convention.
 
     Args:
         numbers: fx, fy, cx, cy; the 9, 12 or 16 numbers of a matrix; or one, the focal length in
             picture widths, of a camera with square pixels and a centred axis.
+        kind: what a matrix is: `"pixels"`, K; `"cam_from_uv"`, the rays, in OpenGL's axes, of u to
+            the right and v upwards, which are -1 and 1 at the picture's borders (HyperSim).
         size: of the picture, height and width.
         first_pixel_centre: the coordinates of the centre of pixel (0, 0) for these numbers: 0 from
             an OpenCV calibration, or 0.5.
@@ -170,6 +174,14 @@ def camera_matrix(
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     else:
         K = values.reshape(4 if len(values) == 16 else 3, -1)[:3, :3]
+        if kind == "cam_from_uv":
+            height, width = size
+            uv_from_pixel = np.array([[2 / width, 0.0, -1.0], [0.0, -2 / height, 1.0], [0, 0, 1]])
+            K = np.linalg.inv(np.diag([1.0, -1.0, -1.0]) @ K @ uv_from_pixel)
+            K = np.round(K / K[2, 2], 12)
+            K[:2, 2] += first_pixel_centre - 0.5  # borders are whole, whatever the pixels' centres
+            if K[2, :2].any():
+                raise SequenceError(source, "are of a tilted lens, whose picture no K describes")
         if K[2].tolist() != [0, 0, 1] and K[:, 2].tolist() == [0, 0, 1]:  # written by columns
             K = K.T.copy()
     if K[1, 1] < 0:
@@ -205,37 +217,54 @@ def as_pose(numbers: NDArray[np.float64], source: object, **options: Any) -> Pos
     return pose
 
 
-class Undistortion:
-    """Removes the distortion of a lens from maps; K doesn't change.
+class Rig:
+    """Brings a frame's picture and depth, as they are stored, to one grid without distortion.
 
     Args:
-        K: the camera's, in flowrep's convention.
-        distortion: OpenCV's k1, k2, p1, p2, k3, ..., 4, 5, 8, 12 or 14 numbers; or k1 to k4 of its
-            fisheye model.
-        size: height and width.
+        distortion: OpenCV's k1, k2, p1, p2, k3, ..., 4, 5, 8, 12 or 14 numbers, or k1 to k4 of its
+            fisheye model; of pictures, and of depth that isn't registered.
+        lens: their formula.
+        colour_from_depth: the pose of a separate depth camera in the pictures' camera, whose depth
+            is registered; None if depth is on the pictures' pixels.
     """
 
     def __init__(
-        self, K: Matrix, distortion: Sequence[float], lens: Lens, size: tuple[int, int]
+        self, distortion: Sequence[float], lens: Lens, colour_from_depth: Pose | None
     ) -> None:
         counts = (4,) if lens == "fisheye" else (4, 5, 8, 12, 14)
-        if len(distortion) not in counts:
+        if len(distortion) not in (0, *counts):
             says = f"has {len(distortion)} numbers, a lens={lens} one of {counts}"
             raise SequenceError("distortion", says)
+        self.distortion, self.lens, self.colour_from_depth = distortion, lens, colour_from_depth
+        self._made: dict[Any, tuple[Any, Any]] = {}
+
+    def __call__(self, rgb: Any, depth: Any, K: Matrix, K_depth: Matrix) -> tuple[Any, Any]:
+        """Returns the picture, or None, and depth; outside of the lens's picture, black and nan."""
+        size = depth.shape if rgb is None else rgb.shape[:2]
+        is_registered = self.colour_from_depth is not None
+        if is_registered:
+            depth = self._once(Registration, K_depth, K, self.colour_from_depth, size)(depth)
+        if self.distortion:
+            columns, rows = self._once(self._stored_pixels, K, size)
+            rgb = None if rgb is None else cv2.remap(rgb, columns, rows, cv2.INTER_LINEAR)
+            if not is_registered:
+                depth = cv2.remap(depth, columns, rows, cv2.INTER_NEAREST, borderValue=[np.nan])
+        return rgb, depth
+
+    def _stored_pixels(self, K: Matrix, size: tuple[int, int]) -> Any:
+        """Returns the column and the row at which the lens shows each pixel of K."""
         opencv = K.copy()
         opencv[:2, 2] -= 0.5  # its pixel centres are whole numbers
-        coefficients = np.array(distortion, dtype=np.float64)
-        make: Any = cv2.fisheye if lens == "fisheye" else cv2
-        self._maps = make.initUndistortRectifyMap(
-            opencv, coefficients, np.eye(3), opencv, size[::-1], cv2.CV_32FC1
-        )
+        make: Any = cv2.fisheye if self.lens == "fisheye" else cv2
+        arguments = opencv, np.array(self.distortion, dtype=np.float64), np.eye(3), opencv
+        return make.initUndistortRectifyMap(*arguments, size[::-1], cv2.CV_32FC1)
 
-    def __call__(self, image: Any, *, nearest: bool = False) -> Any:
-        """Returns the rectified map; nan, or black, outside of the lens's picture."""
-        border = np.nan if image.dtype.kind == "f" else 0.0
-        interpolation = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
-        columns, rows = self._maps
-        return cv2.remap(image, columns, rows, interpolation, borderValue=4 * [border])
+    def _once(self, make: Any, *arguments: Any) -> Any:
+        """Returns `make` of the arguments, and the same object until they change."""
+        made = self._made.get(make)
+        if made is None or not all(map(np.array_equal, made[0], arguments)):
+            made = self._made[make] = arguments, make(*arguments)
+        return made[1]
 
 
 _LARGEST_FOOTPRINT_PX = 8
@@ -260,7 +289,6 @@ class Registration:
         self, K_depth: Matrix, K_colour: Matrix, colour_from_depth: Pose, size: tuple[int, int]
     ) -> None:
         self.size = size
-        self.depth_from_colour = np.linalg.inv(colour_from_depth)
         # The largest focal length of the colour camera divided by the smallest of the depth camera.
         self._finer = np.float32(
             max(K_colour[0, 0], K_colour[1, 1]) / min(K_depth[0, 0], K_depth[1, 1])

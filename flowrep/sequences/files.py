@@ -11,7 +11,7 @@ import json
 import math
 import re
 import struct
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -24,8 +24,7 @@ from PIL.Image import DecompressionBombError as _Bomb
 from flowrep.extras import require
 from flowrep.sequences.recording import SequenceError
 
-DepthCoding: TypeAlias = Literal["float32_rgba", "rgb24"]
-FlowCoding: TypeAlias = Literal["kitti", "vkitti2", "kubric"]
+DepthCoding: TypeAlias = Literal["float32_rgba"]
 FlowMap: TypeAlias = NDArray[np.float32]  # [2, H, W], u right, v down; nan where unknown
 
 PICTURES = (".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".bmp", ".tif", ".tiff", ".npy")
@@ -34,9 +33,10 @@ _SUFFIXES = {
     "picture": PICTURES,
     "map": (".png", ".npy", ".tif", ".tiff", ".pgm", ".pfm", ".exr", ".dpt", *_HDF5),
     "flow": (".flo", ".png", ".npy", ".pfm", *_HDF5),
-    "numbers": (".txt", ".csv", ".json", ".cam", ".pincam"),
+    "numbers": (".txt", ".csv", ".json", ".cam", ".pincam", *_HDF5),
 }
 FLO_TAG = 202021.25
+KITTI_BOUNDS = (-512.0, 511.984375)  # steps of 1/64 px, 0 at 2^15
 _NUMBER = re.compile(r"[-+]?(nan|inf|\.?\d[\d.]*(e[-+]?\d+)?)", re.IGNORECASE)
 UNREADABLE = (ValueError, LookupError, TypeError, ArithmeticError, RecursionError, struct.error)
 # More is no frame and no table, but a mistake or a bomb: a small file may ask for all memory.
@@ -109,50 +109,59 @@ def read_lines(path: Path) -> list[str]:
     return [line for line in lines if line and not line.startswith("#")]
 
 
-def read_table(path: Path, names: int | None = None) -> tuple[NDArray[np.float64], list[str]]:
-    """Returns the numbers of a file, a row a line, and the rows' names in the column `names`.
+def read_table(path: Path, key: int | None = None) -> tuple[NDArray[np.float64], Any]:
+    """Returns the numbers of a file, a row a line, and what stands in the column `key` instead.
 
-    They are separated by blanks or commas; a line that begins with a word is a header, and one
-    without a name in that column is skipped, as COLMAP's lines of points are. For JSON see
-    `read_json`: the numbers of several keys stand side by side. Sintel's `.cam` is one row, K and
-    the extrinsics; a pose of Open3D's `.log` is four lines after one of other numbers.
+    They are separated by blanks or commas. A line that begins with a word is a header; if the key
+    is a word (a picture's name), lines without one, as COLMAP's lines of points, are no rows.
+    `file.txt:key` is the line `key: numbers`; for JSON see `read_json`. An array of HDF5 has a row
+    for each index of its first axis. Sintel's `.cam` is one row, K and the extrinsics; a pose of
+    Open3D's `.log` is four lines after one of other numbers.
     """
-    suffix, rows = path.name.partition(":")[0].rpartition(".")[2].lower(), list[list[str]]()
+    file, _, line = path.name.partition(":")
+    suffix, words = Path(file).suffix.lower(), None
     try:
-        if suffix == "json":
-            parts = [np.array(part, np.float64) for part in read_json(path)]
-            table = np.hstack([p.reshape(len(p) if p.ndim > 1 else p.size, -1) for p in parts])
-        elif suffix == "cam":
+        if suffix == ".json" or suffix in _HDF5:
+            array = np.array(read_json(path) if suffix == ".json" else read_array(path), np.float64)
+            table = array.reshape(len(array) if array.ndim > 1 else array.size, -1)
+        elif suffix == ".cam":
             tag, *row = struct.unpack("<f21d", regular(path).read_bytes())
             table = np.array([row] if tag == FLO_TAG else [])
         else:
-            lines = [line.replace(",", " ") for line in read_lines(path)]
-            if suffix == "log":
+            lines = [text.replace(",", " ") for text in read_lines(path.with_name(file))]
+            if line:
+                lines = [dict(text.partition(":")[::2] for text in lines)[line]]
+            elif suffix == ".log":
                 lines = [" ".join(lines[i + 1 : i + 5]) for i in range(0, len(lines), 5)]
-            if names is not None:
-                rows = [line.split() for line in lines]
-                rows = [x for x in rows if len(x) > names and not _NUMBER.fullmatch(x[names])]
-                lines = [" ".join(row[:names] + row[names + 1 :]) for row in rows]
-            elif lines and not _NUMBER.match(lines[0]):
-                del lines[0]
-            table = np.loadtxt(lines, ndmin=2) if lines else np.empty(0)
+            rows = [text.split() for text in lines]
+            if rows and not _NUMBER.fullmatch(rows[0][0]):
+                del rows[0]
+            if key is not None and any(_is_word(row, key) for row in rows[:2]):
+                rows = [row for row in rows if _is_word(row, key)]
+                words, key = [row.pop(key) for row in rows], None
+            table = np.array(rows, np.float64)
+        if key is not None:
+            return np.delete(table, key, 1), table[:, key]
     except UNREADABLE as error:
-        raise SequenceError(path, f"holds no table of numbers: {error!r}") from None
+        raise SequenceError(path, f"holds no table of numbers: {error}") from None
     if not table.size:
         raise SequenceError(path, "holds no numbers")
-    return table, [row[names or 0] for row in rows]
+    return table, words
 
 
-def read_json(path: Path) -> list[Any]:
-    """Returns what a JSON holds at each of the keys of a path `file.json:key.key+key`.
+def _is_word(row: list[str], column: int) -> bool:
+    return len(row) > column and not _NUMBER.fullmatch(row[column])
+
+
+def read_json(path: Path) -> Any:
+    """Returns what a JSON holds at the keys of a path `file.json:key.key`.
 
     `*` is each item of a list or value of an object; at the end, an object's keys.
     """
     name, _, keys = path.name.partition(":")
     path = path.with_name(name)
     try:
-        whole = json.loads(regular(path).read_bytes())
-        return [_found(whole, key.split(".")) for key in keys.split("+")]
+        return _found(json.loads(regular(path).read_bytes()), keys.split("."))
     except UNREADABLE as error:
         raise SequenceError(path, f"has nothing at {keys}: {error!r}") from None
 
@@ -267,7 +276,7 @@ def read_depth(
         missing: whole numbers that mean missing depth.
         no_surface: the whole number that means no surface.
         coding: of colour pictures: `"float32_rgba"`, a float whose bytes are blue, green, red and
-            alpha (TartanAir V2); `"rgb24"`, red + 256 green + 65536 blue (CARLA).
+            alpha (TartanAir V2).
     """
     stored, usual_m = stored_depth(path, coding)
     depth = (stored * np.float64(usual_m if unit_m is None else unit_m)).astype(np.float32)
@@ -283,8 +292,6 @@ def stored_depth(path: Path, coding: DepthCoding | None = None) -> tuple[NDArray
     stored = read_array(path)
     if coding == "float32_rgba" and stored.dtype == np.uint8 and stored.shape[2:] == (4,):
         stored = np.ascontiguousarray(stored[..., [2, 1, 0, 3]]).view("<f4")[..., 0]
-    elif coding == "rgb24" and stored.dtype == np.uint8 and stored.shape[2:] in ((3,), (4,)):
-        stored = stored[..., :3].astype(np.uint32) @ np.array([1, 256, 65536], np.uint32)
     is_whole = stored.dtype.kind in "ui" and stored.itemsize > 1
     if stored.ndim != 2 or not (is_whole or stored.dtype.kind == "f"):
         given = f"holds {stored.dtype} {list(stored.shape)}"
@@ -293,34 +300,32 @@ def stored_depth(path: Path, coding: DepthCoding | None = None) -> tuple[NDArray
     return stored, 0.001 if is_whole else 1.0
 
 
-def read_flow(path: Path, coding: FlowCoding = "kitti") -> FlowMap:
+def read_flow(
+    path: Path,
+    bounds: Literal["size"] | Sequence[float] = KITTI_BOUNDS,
+    marks_unknown: bool = True,
+) -> FlowMap:
     """Returns the first two channels of a file as flow `[2, H, W]`, nan where unknown.
 
     Args:
-        coding: of a PNG: `"kitti"`, steps of 1/64 px; `"vkitti2"`, shares of the picture's size;
-            `"kubric"`, shares of the range in `data_ranges.json`.
+        bounds: of a PNG: the flow of the codes 0 and 65535, pixels; `"size"`, of u minus and plus
+            the width - 1, of v the height - 1.
+        marks_unknown: of a PNG: whether the third channel is 0 where flow is unknown.
     """
-    stored, suffix = read_array(path), path.suffix.lower()
-    is_right = stored.dtype == np.uint16 if suffix == ".png" else stored.dtype.kind == "f"
+    stored, is_coded = read_array(path), path.suffix.lower() == ".png"
+    is_right = stored.dtype == np.uint16 if is_coded else stored.dtype.kind == "f"
     if not is_right or stored.shape[2:] not in ((2,), (3,)):
         says = f"holds {stored.dtype} {list(stored.shape)}, expected floats [height, width, 2]"
         raise SequenceError(path, f"{says}, or a PNG of three channels of 16 bits")
     flow = stored[..., :2].transpose(2, 0, 1).astype(np.float32)
-    if suffix == ".flo":
+    if path.suffix.lower() == ".flo":
         flow[:, ~(np.abs(flow).max(0) <= _FLO_LARGEST)] = np.nan  # nan compares False
-    if suffix != ".png":
-        return flow
-    if coding == "kubric":
-        kind = path.stem.rpartition("_")[0]  # forward_flow, backward_flow
-        ranges, _ = read_table(path.with_name(f"data_ranges.json:{kind}.min+{kind}.max"))
-        least, most = map(float, ranges[0])
-        return flow * np.float32((most - least) / 65535) + np.float32(least)
-    if coding == "vkitti2":
-        size = np.array(stored.shape[1::-1], np.float32)[:, None, None]  # width, height
-        flow = (flow * np.float32(2 / 65535) - 1) * (size - 1)
-    else:
-        flow = (flow - np.float32(2**15)) / np.float32(64)
-    flow[:, stored[..., 2] == 0] = np.nan
+    if is_coded:
+        most = np.array(stored.shape[1::-1])[:, None, None] - 1.0  # width, height
+        low, high = (-most, most) if bounds == "size" else map(np.float64, bounds)
+        flow = (low + flow * ((high - low) / 65535)).astype(np.float32)
+        if marks_unknown:
+            flow[:, stored[..., 2] == 0] = np.nan
     return flow
 
 

@@ -39,17 +39,14 @@ def open_recording(folder: str | Path, format: str, **options: Any) -> Recording
         there = closest_first(format, group_choices("format"))
         raise SequenceError(f"format={format}", f"is unknown; there are: {there}")
     keys = declaration(format) | options
-    recording: Recording = open_reader(keys.pop("_target_"), folder, keys, options)
+    recording: Recording = open_reader(keys.pop("_target_"), folder, keys)
     return recording
 
 
-def open_reader(target: str, source: str | Path, options: dict[str, Any], given: Any) -> Any:
-    """Returns what a reader opens; files that the options `given` by the user name must exist."""
+def open_reader(target: str, source: str | Path, options: dict[str, Any]) -> Any:
+    """Returns what a reader opens."""
     if (name := target.rpartition(".")[2]) not in READERS:
         there = ", ".join(f"flowrep.sequences.{each}" for each in READERS)
         raise UsageError(f"format._target_={target}: is no reader; there are {there}")
     check_reader_options(READERS[name], options)
-    stream = READERS[name](source, **options)
-    if isinstance(stream, DeclaredRecording):
-        stream.check_files(given)
-    return stream
+    return READERS[name](source, **options)

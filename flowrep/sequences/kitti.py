@@ -38,7 +38,12 @@ class Kitti(Recording):
         name = f"{pair}_{'10' if is_current else '11'}"
         picture = self.folder / "image_2" / f"{name}.png"
         rgb = files.read_rgb(picture)
-        left, right = self._projections(pair)
+        calibration = self.folder / f"calib_cam_to_cam/{pair}.txt"
+        numbers = [files.read_table(Path(f"{calibration}:P_rect_0{i}"))[0] for i in (2, 3)]
+        try:
+            left, right = np.reshape(numbers, (2, 3, 4))
+        except ValueError:
+            raise SequenceError(calibration, "P_rect_02 or P_rect_03 hasn't 12 numbers") from None
         depth = np.full(rgb.shape[:2], np.nan, dtype=np.float32)
         flow: Any = {}
         if is_current:
@@ -52,13 +57,3 @@ class Kitti(Recording):
             flow = {"raw": raw, "raw_since": f"{pair}_11"}
         K = camera_matrix(left, (0, 0), first_pixel_centre=0.0)
         return Frame(name, picture, None, K, depth, rgb, clip=index // 2, **flow)
-
-    def _projections(self, pair: str) -> list[Any]:
-        """Returns the 3 x 4 matrices of the left and the right colour camera."""
-        path = self.folder / "calib_cam_to_cam" / f"{pair}.txt"
-        texts = dict(line.partition(":")[::2] for line in files.read_lines(path))
-        names = "P_rect_02", "P_rect_03"
-        try:
-            return [np.array(texts[name].split(), np.float64).reshape(3, 4) for name in names]
-        except (KeyError, ValueError) as error:
-            raise SequenceError(path, f"lacks one of {', '.join(names)}: {error}") from None

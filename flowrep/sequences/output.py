@@ -1,4 +1,4 @@
-"""What a factorisation writes: the table, flow files, pictures, the video, a rerun recording."""
+"""What a factorisation writes: the table, flow files, pictures, the video, the camera's path."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrep import viz
-from flowrep.extras import require
 from flowrep.files import append_rows
 from flowrep.sequences.factorization import FactorizedFrame, factorize_pair
 from flowrep.sequences.files import FlowMap, write_flo, write_kitti_flow, write_picture
@@ -23,7 +22,6 @@ from flowrep.sequences.recording import Frame, Pose, SequenceError
 
 FLOW_NAMES = ("raw", "ego", "obj")
 _MOVING_SPREAD = 3.0
-_JPEG_QUALITY = 80
 _TILE_PX = 480  # largest side of a tile of the video, so that two rows of three fit on a screen
 
 
@@ -40,7 +38,6 @@ class Output:
         moving_px: the object flow above which a pixel may count as moving.
         masks: whether to write a mask of moving pixels for each frame.
         video_fps: None for no video.
-        rerun: whether to write `scene.rrd` for the viewer rerun.
     """
 
     def __init__(
@@ -55,7 +52,6 @@ class Output:
         moving_px: float = 1.0,
         masks: bool = False,
         video_fps: float | None = None,
-        rerun: bool = False,
     ) -> None:
         self.path = Path(path)
         self.partial = Path(f"{self.path}.partial")
@@ -64,8 +60,6 @@ class Output:
         for folder in (self.path, self.partial):
             if os.path.lexists(folder):
                 raise SequenceError(folder, "exists already; remove it, or give another output")
-        if rerun:  # fail before the folder is created
-            require("rerun=true", "rerun", "rerun")
         self.flow_files, self.pictures_every, self.moving_px = flow_files, pictures_every, moving_px
         self.scale_px = scale_px or dict.fromkeys(FLOW_NAMES, 20.0)
         self.depth_range_m, self.masks = depth_range_m, masks
@@ -74,7 +68,6 @@ class Output:
         self.partial.mkdir(parents=True)
         self._write_json("job.json", settings)
         self._video = viz.Video(self.partial / "strip.mp4", fps=video_fps) if video_fps else None
-        self._rerun = RerunExport(self.partial / "scene.rrd", self.scale_px) if rerun else None
 
     def append(self, index: int, result: FactorizedFrame) -> None:
         """Writes a frame's files, then its row."""
@@ -83,21 +76,18 @@ class Output:
             code = np.where(moves(result, self.moving_px), 255, 0)
             mask = np.where(result.valid, code, 127).astype(np.uint8)
             write_picture(self._file(f"moving/{result.frame.name}.png"), mask)
-        pose = self._write_pose(index, result)
+        self._write_pose(index, result)
         if self._video is not None:
             scales: Any = {"flow_scale_px": self.scale_px, "depth_range_m": self.depth_range_m}
             self._video.append(video_frame(result, **scales))
-        if self._rerun is not None:
-            self._rerun.append(index, result, pose)
         self.rows.append(score(index, result, moving_px=self.moving_px))
         append_rows(self.partial / "frames.csv", self.rows[-1:])  # a killed job keeps its rows
 
     def close(self) -> None:
-        """Completes the video and the rerun recording; removes the folder if there is no frame."""
-        for writer in (self._video, self._rerun):
-            if writer is not None:
-                writer.close()
-        self._video = self._rerun = None
+        """Completes the video; removes the folder if there is no frame."""
+        if self._video is not None:
+            self._video.close()
+        self._video = None
         if not self.rows:
             shutil.rmtree(self.partial, ignore_errors=True)
 
@@ -133,8 +123,8 @@ class Output:
             contents |= {"prev_from_curr": result.motion.prev_from_curr}
             np.savez(self._file(f"flow/{name}.npz"), **contents)
 
-    def _write_pose(self, index: int, result: FactorizedFrame) -> Pose:
-        """Adds a frame's pose to trajectory.txt and returns it: the recorded one, or estimated.
+    def _write_pose(self, index: int, result: FactorizedFrame) -> None:
+        """Adds a frame's pose to trajectory.txt: the recorded one, or estimated.
 
         Estimated motions are chained from the first frame of a clip, from its recorded pose if it
         has one. Frames without a time have their number.
@@ -151,7 +141,6 @@ class Output:
         lines.append(tum_line(_stamp(frame, index), pose))
         with (self.partial / "trajectory.txt").open("a", encoding="utf-8") as file:
             file.writelines(lines)
-        return pose
 
     def _file(self, name: str) -> Path:
         path = self.partial / name
@@ -265,39 +254,3 @@ def video_frame(result: FactorizedFrame, **scales: Any) -> viz.Image:
         above["rgb"] = np.moveaxis(small, -1, 0)
     below = {kind: shown(kind, result)[places] for kind in FLOW_NAMES}
     return viz.contact_sheet([viz.representation_strip(m, **scales) for m in (above, below)])
-
-
-class RerunExport:
-    """Writes the camera, picture, depth and flow of each frame, for the Rerun viewer."""
-
-    def __init__(self, path: Path, scale_px: Mapping[str, float]) -> None:
-        import rerun
-
-        self._rerun: Any = rerun
-        self._stream = rerun.RecordingStream("flowrep", recording_id=path.parent.stem)
-        self._stream.save(str(path))
-        self._scale_px = scale_px
-
-    def append(self, index: int, result: FactorizedFrame, pose: Pose) -> None:
-        """Logs one frame."""
-        rr, frame, log = self._rerun, result.frame, self._stream.log
-        self._stream.set_time("frame", sequence=index)
-        if frame.timestamp_s is not None:
-            self._stream.set_time("time", duration=frame.timestamp_s)
-        log("world/camera", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
-        size, axes = frame.size[::-1], rr.ViewCoordinates.RDF
-        camera = rr.Pinhole(image_from_camera=frame.K, resolution=size, camera_xyz=axes)
-        log("world/camera/image", camera)
-        if frame.rgb is not None:
-            picture = rr.Image(frame.rgb).compress(jpeg_quality=_JPEG_QUALITY)
-            log("world/camera/image/rgb", picture)
-        depth = np.where(np.isfinite(frame.depth), frame.depth, 0.0).astype(np.float32)
-        log("world/camera/image/depth", rr.DepthImage(depth, meter=1.0))
-        for name, scale_px in self._scale_px.items():
-            colours = viz.flow_to_rgb(shown(name, result), scale_px)
-            log(f"flow/{name}", rr.Image(colours).compress(jpeg_quality=_JPEG_QUALITY))
-
-    def close(self) -> None:
-        """Writes what is left."""
-        self._stream.flush()
-        self._stream.disconnect()

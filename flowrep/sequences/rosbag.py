@@ -14,16 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrep.extras import require
-from flowrep.sequences.calibration import (
-    Matrix,
-    Registration,
-    Undistortion,
-    as_pose,
-    camera_matrix,
-    lens_of,
-)
-from flowrep.sequences.declared import between, interpolated_pose, nearest, positions
+from flowrep.sequences.calibration import Lens, Matrix, Rig, as_pose, camera_matrix, lens_of
 from flowrep.sequences.files import decoded, regular
+from flowrep.sequences.matching import keep, match_times, poses_between, positions
 from flowrep.sequences.recording import Frame, Pose, Recording, SequenceError
 
 # Encodings by their type and channels; of colour, the order in which red, green and blue stand.
@@ -90,15 +83,17 @@ class RosBag(Recording):
             self._depth = self._topic("depth", depth, depths)
             stamps, optical = self._index(self._rgb)
             depth_stamps, depth_optical = self._index(self._depth)
-            self.K, self._lens = self._camera(camera_info, self._rgb)
+            self.K, lens = self._camera(camera_info, self._rgb)
             self._edges = self._transforms()
             fixed = np.eye(4)
             if frame_from_cam is not None:
                 fixed = as_pose(np.array(frame_from_cam), "frame_from_cam", layout="xyz_xyzw")
             self._choose(stamps, depth_stamps, frame or optical, world, fixed)
-            self._register = None
+            self._K_depth, colour_from_depth = self.K, None
             if depth_optical != optical:
-                self._register = self._registration(optical, depth_optical)
+                self._K_depth, _ = self._camera(None, self._depth)
+                colour_from_depth = self._between_cameras(optical, depth_optical)
+            self._rig = Rig(*lens, colour_from_depth)
 
     @contextmanager
     def _naming(self) -> Iterator[None]:
@@ -117,11 +112,11 @@ class RosBag(Recording):
         """Matches depth and transforms to pictures, and says how well they fit."""
         start = min(stamps[0], depth_stamps[0])
         times_s, depth_times_s = ((np.array(x) - start) * 1e-9 for x in (stamps, depth_stamps))
-        rows = nearest(depth_times_s, times_s, self.tolerance_s)
-        notes = [f"pictures are {self._rgb}, depth {self._depth}"]
+        (rows, _), _ = match_times(depth_times_s, times_s, self.tolerance_s)
+        said = [f"pictures are {self._rgb}, depth {self._depth}"]
         if (rows >= 0).any():
             lag_s = np.median((depth_times_s[rows] - times_s)[rows >= 0])
-            notes.append(f"depth is {lag_s:+.4f} s from its picture, in the median")
+            said.append(f"depth is {lag_s:+.4f} s from its picture, in the median")
         left_out = {f"without depth within {self.tolerance_s} s": rows < 0}
         poses: Any = [None] * len(times_s)
         edges = self._edges_above(frame, world)
@@ -130,25 +125,17 @@ class RosBag(Recording):
             poses, gap_s = self._poses(edges, times_s, start, fixed)
             lacking = np.isnan(poses).any((1, 2))
             left_out[f"without transforms within {self.tolerance_s} s"] = lacking
-            notes.append(f"poses are interpolated between transforms up to {gap_s:.3f} s apart")
+            said.append(f"poses are interpolated between transforms up to {gap_s:.3f} s apart")
         else:
             there = ", ".join(sorted(self._edges)) or "nothing"
             remedy = "give format.frame= and format.frame_from_cam=, or poses are estimated"
-            notes.append(f"no transform moves {frame} (tf has those of {there}): {remedy}")
-        kept = ~np.any([*left_out.values()], axis=0)
-        for why, frames in left_out.items():
-            if frames.any():
-                notes.append(f"{frames.sum()} of {len(kept)} frames are left out, {why}")
-        if not kept.any():
-            remedy = "none is left: raise format.tolerance_s, or give another format.world"
-            raise SequenceError(self.path, f"{'; '.join(notes)}; {remedy}")
+            said.append(f"no transform moves {frame} (tf has those of {there}): {remedy}")
+        remedy = "raise format.tolerance_s, or give another format.world"
+        kept, notes = keep([*map(_name, stamps)], left_out, self.path, remedy)
         places = positions(times_s)
         # The stamps of a picture and its depth, its pose, its number if no frame were missing.
-        self._moments = [
-            (stamps[i], depth_stamps[rows[i]], poses[i], int(places[i]))
-            for i in np.flatnonzero(kept)
-        ]
-        self.count, self.notes = len(self._moments), tuple(notes)
+        self._moments = [(stamps[i], depth_stamps[rows[i]], poses[i], int(places[i])) for i in kept]
+        self.count, self.notes = len(kept), (*said, *notes)
 
     # Which topics there are.
 
@@ -197,8 +184,8 @@ class RosBag(Recording):
         messages = self._messages(topic, written, written + 1)
         return next(m for _, m in messages if _ns(m.header.stamp) == stamp)
 
-    def _camera(self, given: str | None, topic: str) -> tuple[Matrix, Undistortion | None]:
-        """Returns K of a topic's pictures and their lens, None if it doesn't bend them."""
+    def _camera(self, given: str | None, topic: str) -> tuple[Matrix, tuple[Sequence[float], Lens]]:
+        """Returns K of a topic's pictures, and the distortion and formula of their lens."""
         there = self._of_kind("CameraInfo")
         beside = [f"{topic.rsplit('/', levels)[0]}/camera_info" for levels in (1, 2)]
         named = next((name for name in beside if name in there), None) if given is None else given
@@ -208,9 +195,8 @@ class RosBag(Recording):
         K, D, P = (info.K, info.D, info.P) if is_ros1 else (info.k, info.d, info.p)
         is_rectified = "rect" in topic  # ROS's name for pictures without distortion, of P
         matrix = camera_matrix(P if is_rectified else K, size, 0.0, source)
-        if is_rectified or not np.any(D):
-            return matrix, None
-        return matrix, Undistortion(matrix, [*D], lens_of(info.distortion_model), size)
+        distortion = [*D] if np.any(D) and not is_rectified else []
+        return matrix, (distortion, lens_of(info.distortion_model))
 
     # Where the camera was.
 
@@ -249,16 +235,14 @@ class RosBag(Recording):
                 continue
             order = np.argsort(edge.stamps, kind="stable")
             at_s = (np.array(edge.stamps)[order] - start) * 1e-9
-            before, after, share = between(at_s, times_s, self.tolerance_s)
-            gap_s = max(gap_s, float((at_s[after] - at_s[before])[before >= 0].max(initial=0.0)))
-            sent = np.array(edge.poses)[order]
-            moved = map(interpolated_pose, sent[before], sent[after], share)
-            poses = np.array([*moved]) @ poses
-            poses[before < 0] = np.nan
+            rows, share = match_times(at_s, times_s, self.tolerance_s, interpolate=True)
+            gap_s = max(gap_s, float(np.ptp(at_s[rows], axis=0)[rows[0] >= 0].max(initial=0.0)))
+            poses = poses_between(np.array(edge.poses)[order], rows, share) @ poses
+            poses[rows[0] < 0] = np.nan
         return poses, gap_s
 
-    def _registration(self, colour: str, depth: str) -> Registration:
-        """Returns what brings depth of another optical frame to the pictures."""
+    def _between_cameras(self, colour: str, depth: str) -> Pose:
+        """Returns colour_from_depth, of two optical frames that static transforms connect."""
         ends, bases = [], set()
         for frame in (colour, depth):
             pose = np.eye(4)
@@ -269,22 +253,20 @@ class RosBag(Recording):
         if len(bases) > 1:
             remedy = "record tf_static, or depth aligned to colour (aligned_depth_to_color)"
             raise SequenceError(self.path, f"depth is of {depth}, pictures of {colour}: {remedy}")
-        size = _colour(self._image(self._rgb, self._moments[0][0]), self.path).shape[:2]
-        K_depth, _ = self._camera(None, self._depth)
-        return Registration(K_depth, self.K, np.linalg.inv(ends[0]) @ ends[1], size)
+        return np.linalg.inv(ends[0]) @ ends[1]
 
     def _read(self, index: int) -> Frame:
         stamp, depth_stamp, pose, position = self._moments[index]
         with self._naming():
             rgb: Any = _colour(self._image(self._rgb, stamp), self.path)
             depth: Any = _metres(self._image(self._depth, depth_stamp), self.path)
-        if self._register is not None:
-            depth = self._register(depth)
-        if self._lens is not None:
-            rgb = self._lens(rgb)
-            depth = self._lens(depth, nearest=True) if self._register is None else depth
-        name = f"{stamp // 10**9}.{stamp % 10**9:09d}"
-        return Frame(name, self.path, pose, self.K, depth, rgb, stamp * 1e-9, position=position)
+        rgb, depth = self._rig(rgb, depth, self.K, self._K_depth)
+        options: Any = {"timestamp_s": stamp * 1e-9, "position": position}
+        return Frame(_name(stamp), self.path, pose, self.K, depth, rgb, **options)
+
+
+def _name(stamp: int) -> str:
+    return f"{stamp // 10**9}.{stamp % 10**9:09d}"
 
 
 def _ns(stamp: Any) -> int:

@@ -9,7 +9,8 @@ pytest.importorskip("cv2", reason="recordings need OpenCV")
 
 import cv2
 
-from flowrep.sequences import Registration
+from flowrep.sequences import Registration, SequenceError
+from flowrep.sequences.calibration import camera_matrix
 
 K_DEPTH = np.array([[58.0, 0.0, 33.0], [0.0, 61.0, 22.5], [0.0, 0.0, 1.0]])
 K_COLOUR = np.array([[50.0, 0.0, 30.5], [0.0, 52.0, 26.0], [0.0, 0.0, 1.0]])
@@ -79,3 +80,14 @@ def test_a_turned_camera_sees_each_point_where_it_projects_to():
     seen = Registration(K_DEPTH, K_COLOUR, colour_from_depth, SIZE)(depth)
     assert np.argwhere(np.isfinite(seen)).tolist() == [[row, column]]
     assert seen[row, column] == pytest.approx(z, rel=1e-6)
+
+
+def test_rays_of_a_pictures_borders_are_k_unless_the_lens_is_tilted():
+    # On 8 x 4 pixels: x = 0.5 u + 0.1 and u = column / 4 - 1, so column = 8 x + 3.2;
+    # y = -(0.4 v - 0.05) and v = 1 - row / 2, so row = 5 y + 1.75.
+    rays = np.array([[0.5, 0, 0.1], [0, 0.4, -0.05], [0, 0, -1]])
+    K = camera_matrix(rays, (4, 8), 0.0, kind="cam_from_uv")
+    np.testing.assert_allclose(K, [[8, 0, 3.2], [0, 5, 1.75], [0, 0, 1]])
+    rays[2, 1] = 0.1
+    with pytest.raises(SequenceError, match="tilted"):
+        camera_matrix(rays, (4, 8), 0.5, kind="cam_from_uv")

@@ -74,22 +74,6 @@ def test_of_an_exr_file_the_depth_is_read(moments, tmp_path):
         open_frames(tmp_path)[1]
 
 
-def test_carlas_depth_has_24_bits(moments, tmp_path):
-    # red + 256 green + 65536 blue, of 2^24 - 1 for a kilometre; OpenCV writes blue first.
-    for i, moment in enumerate(moments):
-        code = np.rint(moment.depth / 1000 * (2**24 - 1)).astype(np.uint32)
-        if i == 1:
-            code[2, 3] = 2**24 - 1
-        coded = np.stack([code >> 16, code >> 8 & 255, code & 255], -1).astype(np.uint8)
-        cv2.imwrite(str(tmp_path / f"depth/{i:04d}.png"), coded)
-    unit_m = 1000 / (2**24 - 1)
-    options = {"depth_coding": "rgb24", "depth_unit_m": unit_m, "depth_missing": []}
-    depth = open_frames(tmp_path, **options, depth_no_surface=2**24 - 1)[1].depth
-    assert depth[2, 3] == np.inf
-    depth[2, 3] = moments[1].depth[2, 3]
-    np.testing.assert_allclose(depth, moments[1].depth, atol=unit_m)
-
-
 @pytest.mark.parametrize("suffix", [".ppm", ".tiff", ".bmp", ".npy"])
 def test_pictures_in_files_of_many_kinds(suffix, moments, tmp_path):
     blue_green_red = moments[1].rgb[..., ::-1]
@@ -257,7 +241,7 @@ def test_depth_of_little_confidence_is_missing(moments, tmp_path):
         depth = open_frames(tmp_path, confidence="trust/*", min_confidence=least)[1].depth
         assert np.argwhere(np.isnan(depth)).tolist() == missing
     put(tmp_path / "trust/0001.png", np.zeros((3, 4), np.uint8))
-    with pytest.raises(SequenceError, match="confidence"):
+    with pytest.raises(SequenceError, match=r"trust/0001\.png"):
         open_frames(tmp_path, confidence="trust/*")[1]
 
 
@@ -305,7 +289,7 @@ def test_a_lens_is_taken_out_of_pictures_and_depth(lens, place, tmp_path):
 
 def test_a_lens_needs_as_many_numbers_as_its_formula_has(moments, tmp_path):
     with pytest.raises(SequenceError, match=r"distortion.*fisheye"):
-        open_frames(tmp_path, distortion=RADIAL, lens="fisheye")[0]
+        open_frames(tmp_path, distortion=RADIAL, lens="fisheye")
 
 
 def test_flow_of_distorted_pictures_is_not_used(moments, tmp_path):
@@ -374,8 +358,8 @@ def test_brackets_in_a_name_are_brackets(moments, tmp_path):
         ({"depth_unit_m": "0.001"}, "depth_unit_m"),
         ({"depth_unit_m": -0.001}, "depth_unit_m"),
         ({"depth_intrinsics": [0.0, 0.0, 18.5, 13.0]}, r"format\.depth_intrinsics"),
-        ({"rows_by": "number", "key_column": 99}, r"timestamps\.txt.* 99"),
-        ({"rows_where": [99, 0]}, r"timestamps\.txt.* 99"),
+        ({"rows_by": "number", "key": 99}, r"timestamps\.txt.* 99"),
+        ({"rows_where": [99, 0]}, r"format\.rows_where.*timestamps\.txt.* 99"),
         ({"rows_where": ["first", 0]}, r"format\.rows_where"),
         ({"rows_where": [0]}, r"format\.rows_where"),
         ({"dept": "d/*"}, r"format\.dept"),

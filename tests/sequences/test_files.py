@@ -169,7 +169,7 @@ MISTAKES = [
     ("tum", "depth.txt", ["1 depth/a.png", "2 depth/a.png"], "same name"),
     ("sintel", "camdata_left/cave/frame_0001.cam", bytes(60), "no table"),
     ("sevenscenes", "frame-000001.pose.txt", ["1 0 0 0"], "4 numbers"),
-    ("kitti", "calib_cam_to_cam/000000.txt", ["P_rect_02: 1 2 3"], "P_rect_02"),
+    ("kitti", "calib_cam_to_cam/000000.txt", ["P_rect_02: 1 2 3"], "P_rect_03"),
 ]
 
 

@@ -27,6 +27,7 @@ open_sintel = opener("sintel", scene="cave", backwards=True)
 OPENCV = OPENCV_INTRINSICS
 open_tum, open_realsense = (opener(name, intrinsics=OPENCV) for name in ("tum", "realsense"))
 open_icl_nuim = opener("icl_nuim", poses="livingRoom2.gt.freiburg", intrinsics=OPENCV)
+open_hypersim = opener("hypersim", intrinsics=CAMERA, pose_unit_m=0.0254)
 
 # Format: how it is written, how it is opened, whether it has flow of its own, whether time runs
 # backwards in it, and how far flow may be from the truth: half a step of the format's own, for
@@ -48,6 +49,8 @@ DECLARED = {
     "scannet": (synthetic.write_scannet, opener("scannet"), False, False, 0),
     "realsense": (synthetic.write_realsense, open_realsense, False, False, 0),
     "kubric": (synthetic.write_kubric, opener("kubric"), True, False, 1e-3),
+    "hypersim": (test_tools.write_hypersim, open_hypersim, False, False, 0),
+    "spring": (test_tools.write_spring, opener("spring"), True, False, 0),
 } | {
     name: (partial(test_tools.write, name), opener(name, **options), False, False, 0)
     for name, (*_, options) in test_tools.TOOLS.items()
@@ -72,9 +75,9 @@ def test_what_was_written_is_read_and_object_flow_equals_the_truth(name, tmp_pat
         assert frame.size == (HEIGHT, WIDTH)
         assert frame.depth.dtype == np.float32
         np.testing.assert_array_equal(frame.rgb, moment.rgb)
-        # To the last bit, but where depth is registered or a ray's length: whole numbers times the
-        # unit, as float32.
-        bits = 1e-6 if name in ("sevenscenes", "kubric") else 0
+        # To the last bit, but where depth is registered, a ray's length or disparity: whole numbers
+        # times the unit, as float32.
+        bits = 1e-6 if name in ("sevenscenes", "kubric", "hypersim", "spring") else 0
         np.testing.assert_allclose(frame.depth, moment.depth, rtol=bits)
         if name == "kitti":
             assert frame.world_from_cam is None

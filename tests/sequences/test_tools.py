@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 pytest.importorskip("cv2", reason="recordings need OpenCV")
 
+import cv2
 from scipy.spatial.transform import Rotation
 
 from flowrep.sequences import SequenceError, open_recording
@@ -67,6 +69,50 @@ def write_arkitscenes(folder, moments):
         pincam = f"{WIDTH} {HEIGHT} 31 27 18.5 13"
         put(folder / f"lowres_wide_intrinsics/7_{100 + i / 60:.3f}.pincam", [pincam])
     put(folder / "lowres_wide.traj", lines)
+
+
+def write_hdf5(folder, key, suffix, arrays):
+    h5py = pytest.importorskip("h5py", reason="pip install 'flowrep-rl[hdf5]'")
+    for name, array in arrays.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        with h5py.File(folder / f"{name}{suffix}", "w") as file:
+            file[key] = np.float32(array) if array.shape[:2] == (HEIGHT, WIDTH) else array
+
+
+def write_hypersim(folder):
+    """Frames 1 to 3 of a camera whose frame 0 was left out; asset units are inches."""
+    row, column = np.indices((HEIGHT, WIDTH)) + 0.5
+    ray = np.sqrt(1 + ((column - 18.5) / 31) ** 2 + ((row - 13) / 27) ** 2)
+    moments = make_moments(unit_m=1e-6)
+    poses = np.stack([np.eye(4), *(moment.world_from_cam @ OPENGL for moment in moments)])
+    arrays = {"_detail/cam_00/camera_keyframe_orientations": poses[:, :3, :3]}
+    arrays["_detail/cam_00/camera_keyframe_positions"] = poses[:, :3, 3] / 0.0254
+    for i, moment in enumerate(moments, 1):
+        arrays[f"images/scene_cam_00_geometry_hdf5/frame.{i:04d}.depth_meters"] = moment.depth * ray
+        grey = np.full((HEIGHT, WIDTH, 3), 50 * i, np.uint8)  # which JPEG keeps
+        moments[i - 1] = replace(moment, rgb=grey)
+        picture = cv2.imencode(".jpg", grey)[1].tobytes()
+        put(folder / f"images/scene_cam_00_final_preview/frame.{i:04d}.tonemap.jpg", picture)
+    write_hdf5(folder, "dataset", ".hdf5", arrays)
+    return moments
+
+
+def write_spring(folder):
+    """Maps have four times the pictures' pixels, and values in pixels of the pictures."""
+    moments = make_moments(unit_m=1e-6)
+    for i, moment in enumerate(moments, 1):
+        small = moment.rgb[::2, ::2]
+        moments[i - 1] = replace(moment, rgb=small.repeat(2, 0).repeat(2, 1))
+        put(folder / f"frame_left/frame_left_{i:04d}.png", small)
+        write_hdf5(folder, "disparity", ".dsp5",
+                   {f"disp1_left/disp1_left_{i:04d}": 15.5 * 0.065 / moment.depth})  # fmt: skip
+        if i > 1:
+            flow = -moment.raw.transpose(1, 2, 0) / 2
+            write_hdf5(folder, "flow", ".flo5", {f"flow_BW_left/flow_BW_left_{i:04d}": flow})
+    cameras = [np.linalg.inv(moment.world_from_cam) for moment in moments]
+    put(folder / "cam_data/extrinsics.txt", map(numbers, cameras))
+    put(folder / "cam_data/intrinsics.txt", 3 * [numbers([15.5, 13.5, 9.25, 6.5])])
+    return moments
 
 
 def write_open3d(folder, moments):
