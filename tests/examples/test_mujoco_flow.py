@@ -13,7 +13,7 @@ from tensordict import TensorDict
 
 from flowrep import diagnose
 from flowrep.geometry import transform_points, unproject
-from tests.running import ENVIRONMENT, ROOT, run_python
+from tests.running import ENVIRONMENT, run_python
 
 pytest.importorskip("gymnasium", reason="the example wraps a gymnasium env")
 if importlib.util.find_spec("mujoco") is None:
@@ -71,6 +71,7 @@ record["rolled"] = {
 }
 yard.close()
 torch.save(record, sys.argv[1])
+mujoco_flow.main(sys.argv[2])
 """
 
 
@@ -95,11 +96,18 @@ def backend():
 
 
 @pytest.fixture(scope="module")
-def record(backend, tmp_path_factory):
-    path = tmp_path_factory.mktemp("yard") / "record.pt"
-    result = draw("-c", RECORD, path, backend=backend)
+def drawn(backend, tmp_path_factory):
+    """What the example says, its strip and the record, all from one process."""
+    folder = tmp_path_factory.mktemp("yard")
+    paths = folder / "record.pt", folder / "strip.png"
+    result = draw("-c", RECORD, *paths, backend=backend)
     assert result.returncode == 0, result.stderr
-    return torch.load(path, weights_only=True)
+    return result.stdout, *paths
+
+
+@pytest.fixture(scope="module")
+def record(drawn):
+    return torch.load(drawn[1], weights_only=True)
 
 
 def test_mujoco_samples_pixels_at_their_centres_in_metres_along_z(record):
@@ -140,10 +148,7 @@ def test_a_marker_with_the_number_of_a_body_s_geom_is_not_that_body(record):
     assert (seen == plain["sensor", "instance"][:2, 0])[~is_site].all()
 
 
-def test_the_example_runs_and_writes_its_strip(backend, tmp_path):
-    path = tmp_path / "strip.png"
-    script = ROOT / "examples" / "mujoco_flow.py"
-    result = draw(script, path, backend=backend)
-    assert result.returncode == 0, result.stderr
-    assert "max |obj| of what stands   0.0e+00 px" in result.stdout
-    assert path.read_bytes().startswith(b"\x89PNG")
+def test_the_example_runs_and_writes_its_strip(drawn):
+    said, _, strip = drawn
+    assert "max |obj| of what stands   0.0e+00 px" in said
+    assert strip.read_bytes().startswith(b"\x89PNG")
