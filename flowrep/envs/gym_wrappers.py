@@ -155,12 +155,12 @@ class RepresentationVectorObservation(gym.vector.VectorWrapper):
 
     def _maps(self, sensors: Mapping[str, NDArray[Any]], begun: NDArray[np.bool_]) -> Maps:
         sensed, rows = _sensed(sensors, [self.num_envs]), torch.as_tensor(begun)
-        first = sensed[rows]
         if rows.all():
             self._now = self._one._stack._reset(sensed, sensed)
         else:
             self._now = self._one._stack._step(self._now, sensed)
             if rows.any():
+                first = sensed[rows]
                 self._now[rows] = self._one._stack._reset(first, first)
         return self._one._arrays(self._now)
 
@@ -277,7 +277,7 @@ def _onehot(representations: Representations) -> dict[str, Any]:
 
 
 def _sensed(observation: Mapping[str, NDArray[Any]], batch: Sequence[int] = ()) -> TensorDict:
-    tensors = {key: torch.as_tensor(each) for key, each in observation.items()}
+    tensors = {key: torch.from_numpy(np.asarray(each)) for key, each in observation.items()}
     return TensorDict(
         {"sensor": TensorDict(tensors, batch)}, batch
     )  # nested dicts take twice as long

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, NamedTuple, TypeAlias
+import sys
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -26,7 +27,7 @@ Direction: TypeAlias = Literal["forward", "backward"]
 Grid: TypeAlias = Literal["current", "previous"]
 Channels: TypeAlias = Literal["uv", "row_column"]
 
-MAX_PIXELS_WITHOUT_NUMBA = 1 << 14  # PyTorch is as fast up to here; numba isn't loaded
+MAX_PIXELS_WITHOUT_NUMBA = 1 << 14  # up to here, loading numba isn't worth its second
 
 
 class Flow(NamedTuple):
@@ -91,8 +92,7 @@ def ego_flow(
     (tensor([[-0.5000, -0.5000]]), tensor([[True, True]]))
     """
     batch = _check(depth, K, prev_K, prev_from_curr, dt)
-    u, v, valid = _planes(batch, depth, None, K, prev_K, prev_from_curr.unsqueeze(-3), dt)
-    return Flow(closed_form.stack_planes(u, v), closed_form.mask_channel(valid))
+    return _flow(batch, depth, None, K, prev_K, prev_from_curr.unsqueeze(-3), dt)
 
 
 def rigid_flow(
@@ -133,8 +133,7 @@ def rigid_flow(
     check_shape("instance", instance, (1, "H", "W"), ids=True)
     check_shape("prev_from_curr_by_instance", motions, ("N", 4, 4))
     batch = _check(depth, K, prev_K, motions[..., 0, :, :], dt, instance=instance)
-    u, v, valid = _planes(batch, depth, instance, K, prev_K, motions, dt)
-    return Flow(closed_form.stack_planes(u, v), closed_form.mask_channel(valid))
+    return _flow(batch, depth, instance, K, prev_K, motions, dt)
 
 
 def factorize(
@@ -171,20 +170,21 @@ def factorize(
     >>> ego.flatten(), obj.flatten()
     (tensor([-0.5000, -0.5000]), tensor([0.0000, 3.5000]))
     """
-    if isinstance(raw, Flow):
-        # Viewed as bytes, because inductor's CPU code can't compile a `where` on a bool view.
-        raw = torch.where(raw.valid.view(torch.uint8) != 0, raw.flow, math.nan)
+    raw, raw_known = raw if isinstance(raw, Flow) else (raw, None)
     check_shape("raw", raw, (2, "H", "W"))
     batch = _check(depth, K, prev_K, prev_from_curr, dt, raw=raw)
+    if _suits_numba(depth, K, prev_K, prev_from_curr, dt, raw):
+        from flowrep.geometry import numba_flow  # needs numba
+
+        given: Any = {"raw": raw, "raw_known": raw_known, "camera": prev_from_curr}
+        return Factors(*numba_flow.planes(batch, depth, K, prev_K, dt, **given)[2:])
+    if raw_known is not None:
+        # Viewed as bytes, because inductor's CPU code can't compile a `where` on a bool view.
+        raw = torch.where(raw_known.view(torch.uint8) != 0, raw, math.nan)
     # Ego flow is rounded as in `rigid_flow`, whatever raw's dtype, so that static obj is exactly 0.
     u, v, valid = _planes(batch, depth, None, K, prev_K, prev_from_curr.unsqueeze(-3), dt)
     dtype, compute = widest(u.dtype, raw.dtype), widest(u.dtype, torch.float32)
     raw = as_type(raw, dtype).expand(*batch, -1, -1, -1)
-    if _suits_numba(depth, u, v, raw):
-        from flowrep.geometry import numba_flow  # needs numba
-
-        obj, known = numba_flow.object_flow(raw, u, v, valid)
-        return Factors(closed_form.stack_planes(u, v), obj, closed_form.mask_channel(known))
     raw_u, raw_v = raw.unbind(-3)
     u, v = as_type(u, dtype), as_type(v, dtype)
     # Finite, and small enough for a finite difference.
@@ -202,6 +202,27 @@ def factorize(
         for of_raw, of_ego in ((raw_u, u), (raw_v, v))
     ]
     return Factors(ego, closed_form.stack_planes(*planes), known)
+
+
+def rigid_factors(
+    depth: Tensor,
+    instance: Tensor,
+    K: Tensor,
+    prev_from_curr_by_instance: Tensor,
+    prev_from_curr: Tensor,
+    *,
+    prev_K: Tensor | None = None,
+) -> tuple[Flow, Factors]:
+    """Returns `rigid_flow` and its factors by `factorize`; shapes must be right, with one batch."""
+    motions = prev_from_curr_by_instance
+    if _suits_numba(depth, K, prev_K, motions, prev_from_curr):
+        from flowrep.geometry import numba_flow  # needs numba
+
+        given: Any = {"instance": instance, "motions": motions, "camera": prev_from_curr}
+        planes = numba_flow.planes(depth.shape[:-3], depth, K, prev_K, 1.0, **given)
+        return Flow(*planes[:2]), Factors(*planes[2:])
+    raw = rigid_flow(depth, instance, K, motions, prev_K=prev_K)
+    return raw, factorize(raw, depth, K, prev_from_curr, prev_K=prev_K)
 
 
 def adapt_flow(
@@ -278,6 +299,25 @@ def _check(
     return common_batch(**batches)
 
 
+def _flow(
+    batch: torch.Size,
+    depth: Tensor,
+    instance: Tensor | None,
+    K: Tensor,
+    prev_K: Tensor | None,
+    motions: Tensor,
+    dt: float | Tensor,
+) -> Flow:
+    """Returns the flow of one motion per instance, `[*B, N, 4, 4]`; without ids, of the first."""
+    if _suits_numba(depth, K, prev_K, motions, dt):
+        from flowrep.geometry import numba_flow  # needs numba
+
+        given: Any = {"motions": motions, "instance": instance}
+        return Flow(*numba_flow.planes(batch, depth, K, prev_K, dt, **given)[:2])
+    u, v, valid = _planes(batch, depth, instance, K, prev_K, motions, dt)
+    return Flow(closed_form.stack_planes(u, v), closed_form.mask_channel(valid))
+
+
 def _planes(
     batch: torch.Size,
     depth: Tensor,
@@ -287,10 +327,7 @@ def _planes(
     motions: Tensor,
     dt: float | Tensor,
 ) -> Planes:
-    """Returns the flow planes for one motion per instance, `[*B, N, 4, 4]`.
-
-    Without ids, all pixels have the first motion.
-    """
+    """Returns what `_flow` returns as planes, by PyTorch."""
     height, width = depth.shape[-2:]
     dtype = widest(*(x.dtype for x in (depth, K, prev_K, motions) if x is not None))
     compute = widest(dtype, torch.float32)
@@ -305,10 +342,6 @@ def _planes(
     depth = depth.squeeze(-3).expand(*batch, height, width)
     if instance is not None:
         instance = instance.squeeze(-3).expand(*batch, -1, -1)
-    if _suits_numba(depth, by_motion, x, dt):
-        from flowrep.geometry import numba_flow  # needs numba
-
-        return numba_flow.planes_of_motions(depth, instance, by_motion, x, y, dt)
     if instance is None:
         each = list(by_motion.unsqueeze(-2).unbind(-1))  # [*B, 1, 1]
     else:
@@ -351,8 +384,8 @@ def _table(*entries: Tensor) -> tuple[Tensor, ...]:
     return torch.stack(torch.broadcast_tensors(*entries)).unbind()
 
 
-def _suits_numba(depth: Tensor, *others: float | Tensor) -> bool:
-    """Returns whether `numba_flow` can and should compute: large float32 batches, CPU, no grad."""
+def _suits_numba(depth: Tensor, *others: float | Tensor | None) -> bool:
+    """Returns whether `numba_flow` can and should compute: float32, CPU, no grad."""
     # This comes first, because a branch on sizes would make compiled code recompile for other
     # sizes.
     if torch.compiler.is_compiling():
@@ -360,7 +393,7 @@ def _suits_numba(depth: Tensor, *others: float | Tensor) -> bool:
     tensors = [depth, *(other for other in others if isinstance(other, Tensor))]
     return (
         depth.is_cpu
-        and depth.numel() > MAX_PIXELS_WITHOUT_NUMBA
+        and ("numba" in sys.modules or depth.numel() > MAX_PIXELS_WITHOUT_NUMBA)
         and all(tensor.dtype is torch.float32 and _is_plain(tensor) for tensor in tensors)
         and numba_is_installed()
     )

@@ -110,6 +110,7 @@ class MapTransform(Transform):
             raise ValueError(f"{type(self).__name__}: out_keys names a key twice: {self.out_keys}")
         self.reads = tuple(reads)
         self.compiled = False
+        self._fitting: list[Any] | None = None  # shapes and types that have passed the check
         self.label = " and ".join(repr(key) for key in self.out_keys)
 
     def _inputs(self, source: TensorDictBase | Composite) -> list[Any]:
@@ -125,10 +126,19 @@ class MapTransform(Transform):
                     f"representation {self.label} needs key {key!r}; the env offers {offered}. "
                     f"{remedy}"
                 )
+        # Repeated for each frame, the check would take as long as the flow of a small map.
+        layout = [source.shape, *((value.shape, value.dtype) for value in maps)]
+        if torch.compiler.is_compiling() or layout != self._fitting:
+            self._check_layout(source.shape, maps)
+            self._fitting = None if torch.compiler.is_compiling() else layout
+        return maps
+
+    def _check_layout(self, batch: torch.Size, maps: Sequence[Any]) -> None:
+        """Raises ValueError if shapes and types of tensors or specs don't fit `reads`."""
         # `*B` is the first input's leading dims if these begin with the TensorDict's batch size,
         # since a spec or a TensorDict without batch size may hold batched inputs. If they don't,
         # `*B` is the batch size, and the check below fails.
-        batch, leading = source.shape, maps[0].shape[: -len(self.reads[0].shape)]
+        leading = maps[0].shape[: -len(self.reads[0].shape)]
         if leading[: len(batch)] == batch:
             batch = leading
         agreed: dict[str, int] = {}
@@ -147,7 +157,6 @@ class MapTransform(Transform):
                     f"got {value.dtype} {list(value.shape)}"
                 )
             agreed |= {name: n for name, n in zip(reads.shape, sizes) if isinstance(name, str)}
-        return maps
 
     def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
         """Returns the inputs of `compute`; a subclass may check their values."""

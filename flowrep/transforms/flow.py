@@ -13,11 +13,11 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
+from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
 
 from flowrep import geometry
 from flowrep.geometry.checks import checked_number
-from flowrep.geometry.closed_form import as_type, widest
+from flowrep.geometry.closed_form import as_type
 from flowrep.transforms import base
 from flowrep.transforms.base import (
     Keys,
@@ -30,7 +30,7 @@ from flowrep.transforms.base import (
 
 CAMERA = Reads((3, 3), "float")
 DEPTH_KEY: NestedKey = ("sensor", "depth")
-_RAW_KEYS: Keys = [DEPTH_KEY, ("sensor", "instance"), ("sensor", "instance_motion")]
+RAW_KEYS: list[NestedKey] = [DEPTH_KEY, ("sensor", "instance"), ("sensor", "instance_motion")]
 EGO_KEYS: list[NestedKey] = [DEPTH_KEY, ("sensor", "prev_from_curr")]
 
 # K itself, or the key under which the env gives it.
@@ -97,11 +97,10 @@ class CameraTransform(MapTransform):
         self._rows = None if K is None else K.tolist()
         self.camera_keys = keys
 
-    def _inputs(self, source: TensorDictBase | Composite) -> list[Any]:
-        maps = super()._inputs(source)
+    def _check_layout(self, batch: torch.Size, maps: Sequence[Any]) -> None:
+        super()._check_layout(batch, maps)
         if self._rows is not None:
             geometry.camera.check_size("intrinsics", self._rows, _map_size(maps, self.reads))
-        return maps
 
     def _check_values(self, tensordict: TensorDictBase, *, waits: bool = False) -> None:
         lacks = (tensordict.get(key, None) is None for key in self.in_keys)
@@ -167,8 +166,7 @@ class FlowTransform(CameraTransform):
     def _at_one_precision(self, maps: Sequence[Tensor]) -> list[Any]:
         """Returns the inputs, K, and the previous K or None, in depth's type, at least float32."""
         # Raw and ego flow have to round alike, or obj is rounding noise on static pixels.
-        (depth,) = (x for x, reads in zip(maps, self.reads) if reads == base.DEPTH)
-        dtype = widest(depth.dtype, torch.float32)
+        dtype = torch.promote_types(maps[self.reads.index(base.DEPTH)].dtype, torch.float32)
         maps = [*maps] if self.K is None else [*maps, self.K]
         maps = [as_type(x, dtype) if x.is_floating_point() else x for x in maps]
         # With two keys, K and the previous K are the last of the maps already.
@@ -203,8 +201,9 @@ class RawFlow(FlowTransform):
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
     | `("sensor", "depth")`, m | `"raw"` | float `[*B, 2, H, W]` | any | px/step × `scale` |
-    | `("sensor", "instance")` | `"valid"` if chosen | bool `[*B, 1, H, W]` | | |
-    | `("sensor", "instance_motion")` | `"raw_valid"` | as `"valid"` | | |
+    | `("sensor", "instance")` | `"ego"`, `"obj"` if chosen | as `"raw"` | any | as `"raw"` |
+    | `("sensor", "instance_motion")` | `"valid"` if chosen | bool `[*B, 1, H, W]` | | |
+    | `("sensor", "prev_from_curr")`, for ego, obj | `"raw_valid"` | as `"valid"` | | |
 
     Convention: p_t − p_t' on the current frame's grid, channels (u right, v down), t' the previous
     step (Eq. 1 of the paper). Row i of `instance_motion` `[*B, 1 + N, 4, 4]` takes a point fixed to
@@ -214,20 +213,23 @@ class RawFlow(FlowTransform):
 
     Where flow isn't known, because depth is `nan` or a point was not in front of the previous
     camera, raw is 0 and the mask beside it, `"raw_valid"`, is False. `FlowFactorize` reads both.
+    With ego or obj, the result is that of both transforms, in less time.
 
     Args:
         intrinsics: K `[3, 3]` of the maps, a tensor or nested lists, pixels; or the env's key for
             it, `[*B, 3, 3]`.
         prev_intrinsics: key of the previous frame's K, see `PreviousIntrinsics`; needed if
             `intrinsics` is a key. The same key says that K never changes within an episode.
-        outputs: which of `"raw"` and `"valid"` to write.
-        scale: factor on the flow, finite and not 0; the frame rate gives pixels per second.
+        outputs: which of `"raw"`, `"ego"`, `"obj"` and `"valid"` to write; see `FlowFactorize`.
+        scale: factor on the flow, finite and not 0; the frame rate gives pixels per second. Or a
+            mapping from output to factor.
         compiled: whether `compute` runs through `torch.compile`, which is about five times as fast
             on a CPU and equal up to rounding. Compiling takes up to a minute; later processes take
             the result from torch's cache. If False, and numba is installed, large float32 batches
             on a CPU are computed by numba, two to five times as fast as by PyTorch and bit for bit
             the same.
-        in_keys: depth, instance ids, and one motion for each instance.
+        in_keys: depth, instance ids, and one motion for each instance; for ego and obj, also the
+            camera's motion.
         out_keys: one key for each output; their names by default. The mask's key is raw's with
             `_valid` appended: `("sensor", "flow_valid")` for `("sensor", "flow")`.
 
@@ -252,7 +254,7 @@ class RawFlow(FlowTransform):
         tensor(3.)
     """
 
-    known = ("raw", "valid")
+    known = ("raw", "ego", "obj", "valid")
     masked = ("raw",)
 
     def __init__(
@@ -261,22 +263,28 @@ class RawFlow(FlowTransform):
         *,
         prev_intrinsics: NestedKey | None = None,
         outputs: Sequence[str] = ("raw",),
-        scale: float = 1.0,
+        scale: float | Mapping[str, float] = 1.0,
         compiled: bool = False,
         in_keys: Keys | None = None,
         out_keys: Keys | None = None,
     ) -> None:
-        reads = [base.DEPTH, base.IDS, base.MOTIONS]
-        keys = _RAW_KEYS if in_keys is None else in_keys
+        reads, keys = [base.DEPTH, base.IDS, base.MOTIONS], RAW_KEYS
+        if {"ego", "obj"} & set(outputs):
+            reads, keys = [*reads, base.MOTION], [*RAW_KEYS, EGO_KEYS[-1]]
+        keys = as_keys(keys if in_keys is None else in_keys)
         options: Any = {"outputs": outputs, "scale": scale, "compiled": compiled}
         options |= {"prev_intrinsics": prev_intrinsics}
         super().__init__(intrinsics, reads, keys, out_keys, **options)
 
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
         """Returns the chosen outputs, from depth, instance ids and motions (and K)."""
-        depth, instance, motions, K, prev_K = self._at_one_precision(maps)
-        flow, valid = geometry.rigid_flow(depth, instance, K, motions, prev_K=prev_K)
-        return self._chosen({"raw": flow}, valid)
+        depth, instance, motions, *motion, K, prev_K = self._at_one_precision(maps)
+        given = depth, instance, K, motions, *motion
+        if not motion:
+            flow, known = geometry.rigid_flow(*given, prev_K=prev_K)
+            return self._chosen({"raw": flow}, known)
+        (flow, known), (ego, obj, valid) = geometry.flow.rigid_factors(*given, prev_K=prev_K)
+        return self._chosen({"raw": flow, "ego": ego, "obj": obj}, valid, known)
 
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
         """Returns the outputs' specs; ValueError unless ids' spec has a number for each motion."""
@@ -432,9 +440,11 @@ def masked_flow(flow: Tensor, key: NestedKey, tensordict: TensorDictBase) -> Ten
             f"key {mask_key(key)!r}, the mask of {key!r}, should be bool or whole numbers "
             f"{list(shape)}; got {known.dtype} {list(known.shape)}: convert or rename it"
         )
-    # As bytes, because inductor's CPU code can't compile a `where` on `RawFlow`'s view as bool.
-    unknown = as_type(known, torch.bool).view(torch.uint8) == 0
-    return flow.masked_fill(unknown, math.nan)
+    known = as_type(known, torch.bool)
+    if torch.compiler.is_compiling():
+        # As bytes, because inductor's CPU code can't compile a `where` on `RawFlow`'s view as bool.
+        known = known.view(torch.uint8) != 0
+    return torch.where(known, flow, math.nan)
 
 
 def mask_key(flow: NestedKey) -> NestedKey:

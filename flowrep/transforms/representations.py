@@ -12,7 +12,7 @@ from torchrl.data import Composite
 from torchrl.envs.transforms import Compose, ExcludeTransform, Transform
 
 from flowrep.transforms.estimated_flow import EstimatedFlow
-from flowrep.transforms.flow import FlowFactorize, Intrinsics, RawFlow
+from flowrep.transforms.flow import DEPTH_KEY, RAW_KEYS, FlowFactorize, Intrinsics, RawFlow
 from flowrep.transforms.frame_stack import FrameStack
 from flowrep.transforms.maps import Depth, Rgb, Segmentation
 from flowrep.transforms.motion import EstimateCameraMotion
@@ -138,25 +138,31 @@ def representation_stack(
     transforms = [*noisy, *_maps(chosen, num_classes, keys["depth"])]
     camera: Arguments = {"intrinsics": intrinsics, "prev_intrinsics": prev_intrinsics}
     motion_key = _ESTIMATED_MOTION_KEY if estimates_motion else keys["motion"]
-    # obj needs flow in px/step, as does an estimate of the motion.
-    needs_unscaled = "obj" in flows or estimates_motion
+    # RawFlow factorises exact flow in the same pass, but not by noisy depth.
+    by_pass = [name for name in flows if name == "raw" or keys["depth"] == DEPTH_KEY]
+    # Elsewhere, obj needs flow in px/step, as does an estimate of the motion.
+    splits = "obj" in flows and not (estimator is None and "obj" in by_pass)
+    needs_unscaled = splits or estimates_motion
     unscaled = _UNSCALED_KEY if estimator is None else _ESTIMATED_FLOW_KEY
     sources: list[Transform] = []
     if estimator is not None and (needs_unscaled or "raw" in flows):
         inputs = [_PICTURES_KEY, keys["depth"], motion_key]
         sources = _estimated_flow(flows, estimator, camera, inputs, estimates_motion)
-    elif estimator is None and needs_unscaled:
+    elif needs_unscaled:
         sources = [RawFlow(**camera, compiled=compiled, out_keys=unscaled)]
         if estimates_motion:
             sources.append(_motion([unscaled, keys["depth"]], camera))
-    elif estimator is None and "raw" in flows:
-        sources = [RawFlow(**camera, compiled=compiled, **flows["raw"])]
+    elif estimator is None and not {"raw", "obj"}.isdisjoint(flows):
+        inputs = [*RAW_KEYS, *([] if by_pass == ["raw"] else [motion_key])]
+        scales = {name: flows[name]["scale"] for name in by_pass}
+        options: Arguments = {"outputs": by_pass, "scale": scales, "in_keys": inputs}
+        sources = [RawFlow(**camera, **options, compiled=compiled)]
     for transform in sources:
         if transform.out_keys[0] not in flows:  # errors name the representations that need it
             transform.label = " and ".join(map(repr, flows))
     transforms += sources
-    is_written = any("raw" in transform.out_keys for transform in sources)
-    factors = {name: flows[name] for name in flows if not (name == "raw" and is_written)}
+    written_flows = {key for transform in sources for key in transform.out_keys}
+    factors = {name: flows[name] for name in flows if name not in written_flows}
     if factors:
         factorize = FlowFactorize(
             **camera,

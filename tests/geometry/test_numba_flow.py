@@ -1,6 +1,7 @@
 """The single pass equals PyTorch's passes over the pixels, bit for bit."""
 
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -19,16 +20,11 @@ FROM_BEHIND = rigid((0.0, 0.0, 0.0), (0.0, 0.0, -9.0))
 LEAST = float(np.float32(closed_form.LEAST_POSITIVE))
 
 
-@pytest.fixture(autouse=True)
-def _no_map_is_small(monkeypatch):
-    monkeypatch.setattr(flow_module, "MAX_PIXELS_WITHOUT_NUMBA", 0)
-
-
 @pytest.fixture
 def calls(monkeypatch):
     """Lists the arguments of each call of the single pass."""
-    seen, compute = [], numba_flow.planes_of_motions
-    monkeypatch.setattr(numba_flow, "planes_of_motions", lambda *a: seen.append(a) or compute(*a))
+    seen, compute = [], numba_flow.planes
+    monkeypatch.setattr(numba_flow, "planes", lambda *a, **k: seen.append(a) or compute(*a, **k))
     return seen
 
 
@@ -54,7 +50,7 @@ def scene(dtype=torch.float32):
 def by_torch(compute, *args, **options):
     """Returns what PyTorch computes without the kernel."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(flow_module, "MAX_PIXELS_WITHOUT_NUMBA", 1 << 30)
+        patch.setattr(flow_module, "numba_is_installed", lambda: False)
         return compute(*args, **options)
 
 
@@ -94,6 +90,12 @@ def test_factors_and_what_they_share(calls):
     for ours, theirs in zip(factors, by_torch(factorize, raw, depth, Ks, motions[:, 0])):
         assert torch.equal(ours, theirs)
     assert factors.valid[0, 0, 1, :4].tolist() == [False, False, False, True]
+    drifted = motions[:, 0] + 0.01
+    inputs = depth, instance, Ks, motions, drifted
+    raw, factors = flow_module.rigid_factors(*inputs, prev_K=1.1 * Ks)
+    assert_same_bits(raw, by_torch(flow_module.rigid_factors, *inputs, prev_K=1.1 * Ks)[0])
+    for ours, theirs in zip(factors, by_torch(factorize, raw, depth, Ks, drifted, prev_K=1.1 * Ks)):
+        assert torch.equal(ours, theirs)
 
 
 def test_a_gradient_of_raw_flow_alone(calls):
@@ -135,12 +137,14 @@ def test_other_floats_are_left_to_pytorch(calls, dtype):
 
 def test_small_maps_and_those_without_numba_are_left_to_pytorch(calls, monkeypatch):
     depth, _, Ks, motions = scene()
+    by_torch(ego_flow, depth, Ks, motions[:, 0])
+    monkeypatch.delitem(sys.modules, "numba")  # as if nothing had loaded it yet
     monkeypatch.setattr(flow_module, "MAX_PIXELS_WITHOUT_NUMBA", depth.numel())
     ego_flow(depth, Ks, motions[:, 0])
-    monkeypatch.setattr(flow_module, "MAX_PIXELS_WITHOUT_NUMBA", 0)
-    monkeypatch.setattr(flow_module, "numba_is_installed", lambda: False)
-    ego_flow(depth, Ks, motions[:, 0])
     assert not calls
+    monkeypatch.setattr(flow_module, "MAX_PIXELS_WITHOUT_NUMBA", depth.numel() - 1)
+    ego_flow(depth, Ks, motions[:, 0])
+    assert len(calls) == 1
 
 
 def test_gradients_are_pytorch_s(calls):

@@ -119,6 +119,7 @@ STACKS = {
         ),
         RenameTransform([("sensor", "flow")], ["raw"]),
     ),
+    "in one pass": lambda K: RawFlow(K, outputs=["raw", "ego", "obj", "valid"]),
     "representation_stack": lambda K: representation_stack(["raw", "ego", "obj"], intrinsics=K),
 }
 

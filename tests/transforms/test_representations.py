@@ -28,9 +28,9 @@ def rollout(representations) -> torch.Tensor:
     [
         (["ego"], "FlowFactorize"),
         (["raw"], "RawFlow DropKeys"),
-        (["obj"], "RawFlow FlowFactorize DropKeys"),
-        (["obj", "ego", "raw"], "RawFlow FlowFactorize DropKeys"),
-        (["ego", "raw"], "RawFlow FlowFactorize DropKeys"),
+        (["obj"], "RawFlow"),
+        (["obj", "ego", "raw"], "RawFlow DropKeys"),
+        (["ego", "raw"], "RawFlow DropKeys"),
         (["seg", "seg2", "depth"], "Segmentation Depth FrameStack"),
         (["depth2", "seg2"], "Depth Segmentation FrameStack FrameStack DropKeys"),
         (["rgb"], "Rgb"),
