@@ -2,9 +2,8 @@
 
     python examples/export_agent.py outputs/<day>/<run> agent.pt2
 
-The file is also a policy for `flowrep.evaluate`: policy=agent.pt2 with the maps in the printed
-order and the camera of the training. PyTorch's loader unpickles parts of it, which can run code, so
-load only files that you trust.
+docs/other_agents.md says how `flowrep.evaluate` drives it. PyTorch's loader unpickles parts of the
+file, which can run code, so load only files that you trust.
 """
 
 import sys

@@ -328,7 +328,9 @@ def test_an_agent_that_the_example_exports_drives_as_it_did_in_flowrep(tmp_path)
     camera = run.read_config()["scene"]["camera"]
     same = [f"scene.camera.{key}={camera[key]}" for key in ("height_px", "width_px", "fov_deg")]
     maps = f"representations=[{','.join(names)}]"
-    rows = own(program, tmp_path / "out", maps, *same, "episodes=3", SHORT)
+    script = tmp_path / "exported.py"
+    script.write_text(f"from examples.export_agent import load\nmake = lambda _: load({program!r})")
+    rows = own(f"{script}:make", tmp_path / "out", maps, *same, "episodes=3", SHORT)
     driven = [(row["episode_seed"], row["outcome"], row["return"]) for row in rows]
     assert driven == [(row["episode_seed"], row["outcome"], row["return"]) for row in mine]
     agent, act = Agent.load(run.path, precision="fp32", device="cpu"), export_agent.load(program)

@@ -50,7 +50,7 @@ def smoke_run(tmp_path_factory):
         # no such folder or file
         ("train resume=nothing", 2),
         ("evaluate run=nothing", 2),
-        ("evaluate policy=nothing.pt2 scene=s_turn representations=[ego]", 2),
+        ("evaluate policy=nothing.py:make scene=s_turn representations=[ego]", 2),
         ("factorize input=nothing output=out format=tum", 2),
         ("report nothing", 2),
         ("view policy=nothing.py:make", 2),

@@ -90,7 +90,7 @@ class Agent(Driver):
         Args:
             name: the folder of a run, a .safetensors file that `save` wrote, "pretrained" (the
                 agent of the scene that comes with flowrep), a baseline, or a policy from another
-                project: path.py:make, package.module:make or path.pt2.
+                project: path.py:make or package.module:make.
             trusted: classes outside of flowrep that a run may name; their code runs.
             precision: the number format of a trained agent's networks, instead of the run's.
             env: `scene`, a name or a definition (a trained agent keeps the camera of its training,

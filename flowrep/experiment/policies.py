@@ -46,11 +46,11 @@ def policy_of(name: str | Path) -> NamedPolicy:
         return RunPolicy(name)
     if name == "pretrained" or name.endswith(".safetensors"):
         return SavedPolicy(name)
-    if ":" in name or name.endswith(".pt2"):
+    if ":" in name:
         return ForeignPolicy(name)
     raise UsageError(
         f"policy={name}: give {', '.join(get_args(BaselineName))}, pretrained, a run's folder, "
-        "path.safetensors, path.py:make, package.module:make or path.pt2"
+        "path.safetensors, path.py:make or package.module:make"
     )
 
 
@@ -273,20 +273,18 @@ class Task:
 
 
 class ForeignPolicy(NamedPolicy):
-    """A policy from another project: path.py:make, package.module:make or path.pt2.
+    """A policy from another project: path.py:make or package.module:make.
 
-    `make` is a function that takes the task and returns the policy's function. A path.pt2 is a
-    program that `torch.export.save` wrote: it takes the maps as arguments, in the task's order, and
-    returns a score per action.
+    `make` is a function that takes the task and returns the policy's function.
     """
 
     takes = (*NamedPolicy.takes, "representations", "flow", "motion", "noise")
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
-        file = name if name.endswith(".pt2") else name.rpartition(":")[0]
-        if file.endswith((".py", ".pt2")):
-            _check_is_there(name, file)
+        self.module, _, self.function = name.rpartition(":")
+        if self.module.endswith(".py"):
+            _check_is_there(name, self.module)
 
     def load(self, env: Mapping[str, Any], trusted: Collection[str], precision: Any) -> Loaded:
         """Returns the policy, built for the task in the env."""
@@ -315,12 +313,9 @@ class ForeignPolicy(NamedPolicy):
     def built_for(self, task: Task) -> ForeignFunction:
         """Returns the policy for a task."""
         with _naming_policy(self.name):
-            if self.name.endswith(".pt2"):
-                return ForeignFunction(self.name, _program(self.name, task), task)
-            module, _, name = self.name.rpartition(":")
-            act = getattr(_module(module), name)(task)
+            act = getattr(_module(self.module), self.function)(task)
             if not callable(act):
-                what = f"{name}(task) returned a {type(act).__name__}"
+                what = f"{self.function}(task) returned a {type(act).__name__}"
                 raise PolicyError(f"{what}; expected a function of a TensorDict of maps")
         return ForeignFunction(self.name, act, task)
 
@@ -387,21 +382,6 @@ def _module(name: str) -> Any:
     sys.modules[module.__name__] = module
     spec.loader.exec_module(module)
     return module
-
-
-def _program(path: str, task: Task) -> Callable[[TensorDictBase], Tensor]:
-    import torch
-    from torch.export.passes import move_to_device_pass
-
-    try:
-        loaded = torch.export.load(path)
-    except Exception as error:
-        raise PolicyError(
-            "is damaged, or was not saved by torch.export.save of this PyTorch; save it again"
-        ) from error
-    # Moving only the module would not change the devices that are written in its graph.
-    program = move_to_device_pass(loaded, task.device).module()
-    return lambda maps: program(*(maps[name] for name in task.representations)).argmax(-1)
 
 
 # Prefixes of the names of files that the author of a policy didn't write.
