@@ -103,7 +103,7 @@ class ZedLive:
 
 def main(source: str, folder: str) -> None:
     stream = ZedLive(source)
-    with closing(Output(folder, {"input": source}, flow_files=(), video_fps=15)) as output:
+    with closing(Output(Path(folder), {"input": source}, flow_files=(), video_fps=15)) as output:
         job = Job(stream, EstimatedFlowSource(DIS("fast")), recorded_motion, output)
         job.run()
     output.finish(job.summary(None))

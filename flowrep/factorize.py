@@ -105,7 +105,7 @@ def factorize_recording(config: FactorizeConfig) -> int:
     for note in stream.notes:
         print(f"note: {note}")
     output = Output(
-        config.output,
+        Path(config.output),
         config.plain(),
         flow_files=config.flow_files,
         pictures_every=config.pictures_every,

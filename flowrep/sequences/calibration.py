@@ -163,11 +163,12 @@ def camera_matrix(
     array([320., 240.])
     """
     values = np.array(numbers, dtype=np.float64).ravel()
-    if len(values) == 1:
+    if len(values) == 1 and kind == "pixels":
         width, shift = size[1], 0.5 - first_pixel_centre
         values = np.array([*(values * width).repeat(2), width / 2 - shift, size[0] / 2 - shift])
-    if len(values) not in (4, 9, 12, 16):
+    if len(values) not in ((4, 9, 12, 16) if kind == "pixels" else (9,)):
         meaning = "[fx, fy, cx, cy], a matrix, or [a focal length in picture widths]"
+        meaning = meaning if kind == "pixels" else "the nine numbers of cam_from_uv"
         raise SequenceError(source, f"should be {meaning}, not {values.tolist()}")
     if len(values) == 4:
         fx, fy, cx, cy = values

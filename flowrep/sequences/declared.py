@@ -87,8 +87,13 @@ class DeclaredRecording(Recording):
 
     def __post_init__(self) -> None:
         self.folder = Path(self.folder)
-        if self.depth_unit_m is not None and not self.depth_unit_m > 0:
-            raise ValueError(f"depth_unit_m must be positive, got {self.depth_unit_m}")
+        for name in ("depth_unit_m", "pose_unit_m", "flow_unit_px"):
+            if (unit := getattr(self, name)) is not None and not unit > 0:
+                raise ValueError(f"{name} must be positive, got {unit}")
+        if self.flow_range != "size" and len(self.flow_range) != 2:
+            raise ValueError(
+                f"flow_range is size, or the least and the most, not {self.flow_range}"
+            )
         options = "flow", "flow_mask", "times", "poses"
         self._flow, self._flow_mask, self._times, self._pose_files = map(self._sources, options)
         self._check_flow()
@@ -210,6 +215,8 @@ class DeclaredRecording(Recording):
         """
         path, keys = self._path(sources[0]), None
         if "*" in sources[0].partition(":")[0]:  # a file per frame, whose numbers are its row
+            if len(sources) > 1:
+                raise SequenceError(path, f"is a file per frame, which can't join {sources[1:]}")
             paths = [self._file(sources[0], "numbers", name) for name in self._names]
             parts = [files.read_table(path)[0].ravel()[None] for path in paths]
             sizes = [part.shape[1] for part in parts]

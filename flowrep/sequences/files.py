@@ -118,7 +118,8 @@ def read_table(path: Path, key: int | None = None) -> tuple[NDArray[np.float64],
     for each index of its first axis. Sintel's `.cam` is one row, K and the extrinsics; a pose of
     Open3D's `.log` is four lines after one of other numbers.
     """
-    file, _, line = path.name.partition(":")
+    # The name of a file may hold a colon, e.g. a time's.
+    file, _, line = (path.name, "", "") if path.exists() else path.name.partition(":")
     suffix, words = Path(file).suffix.lower(), None
     try:
         if suffix == ".json" or suffix in _HDF5:

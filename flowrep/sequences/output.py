@@ -7,6 +7,7 @@ import math
 import os
 import shutil
 from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ _MOVING_SPREAD = 3.0
 _TILE_PX = 480  # largest side of a tile of the video, so that two rows of three fit on a screen
 
 
+@dataclass(eq=False)
 class Output:
     """The folder of a job: `<path>.partial` while it runs, `<path>` once it is complete.
 
@@ -33,41 +35,38 @@ class Output:
         settings: of the job, written to `job.json`.
         flow_files: formats of flow files: any of "flo", "kitti" and "npz".
         pictures_every: the number of frames from one set of flow pictures to the next; 0 for none.
-        scale_px: the flow that has full colour, by name; None is 20 for each.
+        scale_px: the flow that has full colour, by name.
         depth_range_m: the depth at the end of the video's colour scale.
         moving_px: the object flow above which a pixel may count as moving.
         masks: whether to write a mask of moving pixels for each frame.
         video_fps: None for no video.
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        settings: Mapping[str, Any],
-        *,
-        flow_files: Sequence[str] = ("flo",),
-        pictures_every: int = 10,
-        scale_px: Mapping[str, float] | None = None,
-        depth_range_m: float = 10.0,
-        moving_px: float = 1.0,
-        masks: bool = False,
-        video_fps: float | None = None,
-    ) -> None:
-        self.path = Path(path)
+    path: Path
+    settings: Mapping[str, Any]
+    _: KW_ONLY
+    flow_files: Sequence[str] = ("flo",)
+    pictures_every: int = 10
+    scale_px: Mapping[str, float] = field(default_factory=lambda: dict.fromkeys(FLOW_NAMES, 20.0))
+    depth_range_m: float = 10.0
+    moving_px: float = 1.0
+    masks: bool = False
+    video_fps: float | None = None
+
+    def __post_init__(self) -> None:
+        self.path = Path(self.path)
         self.partial = Path(f"{self.path}.partial")
         if self.partial.is_dir() and {file.name for file in self.partial.iterdir()} == {"job.json"}:
             shutil.rmtree(self.partial)  # of a job that was killed before its first frame
         for folder in (self.path, self.partial):
             if os.path.lexists(folder):
                 raise SequenceError(folder, "exists already; remove it, or give another output")
-        self.flow_files, self.pictures_every, self.moving_px = flow_files, pictures_every, moving_px
-        self.scale_px = scale_px or dict.fromkeys(FLOW_NAMES, 20.0)
-        self.depth_range_m, self.masks = depth_range_m, masks
         self.rows: list[dict[str, Any]] = []
         self._poses: dict[str, Pose] = {}
         self.partial.mkdir(parents=True)
-        self._write_json("job.json", settings)
-        self._video = viz.Video(self.partial / "strip.mp4", fps=video_fps) if video_fps else None
+        self._write_json("job.json", self.settings)
+        fps, file = self.video_fps, self.partial / "strip.mp4"
+        self._video = viz.Video(file, fps=fps) if fps else None
 
     def append(self, index: int, result: FactorizedFrame) -> None:
         """Writes a frame's files, then its row."""
