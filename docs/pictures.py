@@ -9,7 +9,6 @@ has the output of each transform, for its page.
 
 import sys
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +24,7 @@ from flowrep.viz import (
     DEPTH_RANGE_M,
     FLOW_SCALE_PX,
     classes_to_rgb,
-    depth_bar,
+    depth_note,
     depth_to_rgb,
     flow_note,
     flow_to_rgb,
@@ -36,7 +35,7 @@ from flowrep.viz import (
 
 SIZE_PX = 160  # of the transforms' pictures
 NOTES = {name: flow_note(scale) for name, scale in FLOW_SCALE_PX.items()}
-NOTES |= {"depth": partial(depth_bar, DEPTH_RANGE_M), "z": partial(depth_bar, DEPTH_RANGE_M)}
+NOTES |= dict.fromkeys(("depth", "z"), depth_note(DEPTH_RANGE_M))
 PARTS = np.array([(235, 235, 235), (222, 40, 60), (46, 64, 196), (60, 160, 90)], dtype=np.uint8)
 
 

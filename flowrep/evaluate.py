@@ -71,10 +71,7 @@ def candidates_of(config: EvaluateConfig) -> list[Candidate]:
     from flowrep.experiment.policies import ForeignPolicy, SavedPolicy, policy_of
     from flowrep.experiment.run import RunFolder
 
-    runs: dict[Path, RunFolder] = {}  # each run once, even if it is named in several ways
-    for path in config.run or []:
-        for run in RunFolder.all_in(path):
-            runs.setdefault(run.path.resolve(), run)
+    runs = RunFolder.all_in(config.run or [])
     for name in config.other_policies:
         if not isinstance(policy_of(name), ForeignPolicy | SavedPolicy):
             raise UsageError(f"policy={name}: evaluate a run by run=, a baseline by baselines=")
@@ -84,7 +81,7 @@ def candidates_of(config: EvaluateConfig) -> list[Candidate]:
     machine = config.model_dump(include={"device", "num_envs", "num_workers"})
     if not config.other_policies:
         load = partial(Agent.load, scene=config.scene, trusted=config.trusted, **machine)
-        return [Candidate(run, partial(load, run.path), config.policy) for run in runs.values()]
+        return [Candidate(run, partial(load, run.path), config.policy) for run in runs]
     keys = ("scene", "representations", "flow", "motion", "noise")
     maps = {key: getattr(config, key) for key in keys}
     candidates = []

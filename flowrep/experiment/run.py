@@ -76,12 +76,22 @@ class RunFolder:
         return cls(path)
 
     @classmethod
-    def all_in(cls, path: str | Path) -> list[RunFolder]:
-        """Opens a run's folder, or all run folders in a sweep's folder."""
-        configs = filter(Path.is_file, Path(path).glob("*/config.yaml"))
-        runs = sorted(config.parent for config in configs)
-        is_sweep = runs and not (Path(path) / "config.yaml").is_file()
-        return [cls(run) for run in runs] if is_sweep else [cls.existing(path)]
+    def all_in(cls, paths: Iterable[str | Path]) -> list[RunFolder]:
+        """Opens the runs in folders, at any depth, each once."""
+        found: dict[Path, RunFolder] = {}
+        for path in map(Path, paths):
+            # Hydra leaves copies of a run's config.yaml inside of its folder, as wandb did.
+            runs = [
+                config.parent
+                for config in sorted(path.rglob("config.yaml"))
+                if {".hydra", "wandb"}.isdisjoint(config.relative_to(path).parts)
+            ]
+            if not runs:
+                what = "holds no run" if path.exists() else "does not exist"
+                raise RunFolderError(f"'{path}' {what}: give the folder of a run or of a sweep")
+            for run in runs:
+                found.setdefault(run.resolve(), cls(run))
+        return list(found.values())
 
     def check_is_new(self) -> None:
         """Checks that a run can begin here."""

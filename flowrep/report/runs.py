@@ -108,21 +108,14 @@ class Run:
 
 def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
     """Returns the runs in folders at any depth, and a warning for each that was left out."""
-    runs: dict[str, Run] = {}  # by path, so that a folder given twice counts once
+    runs: list[Run] = []
     warnings: list[str] = []
-    for folder in folders:
-        # Hydra leaves copies, as wandb did, of a run's config.yaml inside of its folder.
-        paths = [config.parent for config in sorted(folder.rglob("config.yaml"))]
-        paths = [p for p in paths if {".hydra", "wandb"}.isdisjoint(p.relative_to(folder).parts)]
-        if not paths:
-            what = "holds no run" if folder.exists() else "does not exist"
-            raise RunFolderError(f"'{folder}' {what}. Give the folder of a run or of a sweep")
-        for path in paths:
-            try:
-                runs.setdefault(str(path.resolve()), read_run(path))
-            except (RunFolderError, TableError, OSError, UnicodeDecodeError) as error:
-                warnings.append(" ".join(str(error).split()))
-    return list(runs.values()), warnings
+    for folder in RunFolder.all_in(folders):
+        try:
+            runs.append(read_run(folder.path))
+        except (RunFolderError, TableError, OSError, UnicodeDecodeError) as error:
+            warnings.append(" ".join(str(error).split()))
+    return runs, warnings
 
 
 def read_run(path: Path) -> Run:

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Image = NDArray[np.uint8]
-Note = str | Callable[[int], Image]
 
 FLOW_SCALE_PX: dict[str, float] = {"raw": 20.0, "ego": 20.0, "obj": 5.0}
 """Flow magnitude in pixels at which a representation's colour is fully saturated."""
@@ -143,7 +142,7 @@ class Tile(NamedTuple):
 
     label: str
     draw: Callable[[Any], Image]  # takes the map [C, H, W]
-    note: Note = ""  # below the label
+    note: str = ""  # below the label
     is_flow: bool = False  # whether it has the colours of `flow_to_rgb`
 
 
@@ -157,7 +156,7 @@ def stock_tiles(
     tiles = {
         "rgb": Tile("RGB", _picture),
         "seg": Tile("segmentation", classes_to_rgb),
-        "depth": Tile("depth, logarithmic", depth_colours, partial(depth_bar, depth_range_m)),
+        "depth": Tile("depth, logarithmic", depth_colours, depth_note(depth_range_m)),
     }
     for name, scale_px in {**FLOW_SCALE_PX, **flow_scale_px}.items():
         draw = partial(flow_to_rgb, scale_px=scale_px)
@@ -222,19 +221,16 @@ def flow_note(scale_px: float) -> str:
     return f"full at {scale_px:g} px, half at {scale_px / 4:g} px"
 
 
-def depth_bar(range_m: float, width: int) -> Image:
-    """Returns a labelled bar of the depth colours from 0 m to `range_m`, on a logarithmic scale."""
-    metres = np.expm1(np.linspace(0, np.log1p(range_m), width))
-    bar = depth_to_rgb(metres[None, None].repeat(_NOTE_PX - 2, axis=1), range_m)
-    ends = {2: ("near", "lm", (0, 0, 0)), width - 2: (f"{range_m:g} m", "rm", (255, 255, 255))}
-    return written(bar, {(x, (_NOTE_PX - 2) // 2): text for x, text in ends.items()}, size=13)
+def depth_note(range_m: float) -> str:
+    """Returns the legend of depth up to a range."""
+    return f"light is near, dark {range_m:g} m or more"
 
 
 def strip(
     images: Mapping[str, Image],
     *,
     wheel_for: Collection[str] = (),
-    notes: Mapping[str, Note] = MappingProxyType({}),
+    notes: Mapping[str, str] = MappingProxyType({}),
     framed: Collection[str] = (),
 ) -> Image:
     """Returns images side by side, each under its label.
@@ -245,7 +241,7 @@ def strip(
     Args:
         images: by label, `[H, W, 3]`.
         wheel_for: labels that have the flow wheel next to them.
-        notes: by label, the note below it: a text, or a function from a width to a legend.
+        notes: by label, the text below it.
         framed: labels with a frame around label and image.
 
     Raises:
@@ -264,13 +260,8 @@ def strip(
             title[1 : _BAR_PX - 1, -_BAR_PX:-2] = flow_wheel(_BAR_PX - 2)
         column = [title, resized(image, height, width)]
         if notes.keys() & images.keys():  # below all labels, so that all images stand level
-            note = notes.get(label, "")
-            if isinstance(note, str):
-                bar = text_bar(note, width, _NOTE_PX, colour=_NOTE_COLOUR)
-            else:
-                bar = note(width)
-            rows = (0, _NOTE_PX - len(bar)), (0, 0), (0, 0)
-            column.insert(1, np.pad(bar, rows, constant_values=255))
+            bar = text_bar(notes.get(label, ""), width, _NOTE_PX, colour=_NOTE_COLOUR)
+            column.insert(1, bar)
         whole = np.concatenate(column)
         if framed:
             size = len(whole) + 2 * _FRAME_PX, whole.shape[1] + 2 * _FRAME_PX, 3
