@@ -23,9 +23,9 @@ from torch.distributions import Categorical
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from tqdm import trange
 
-from flowrep.agent import keep_freed_memory
-from flowrep.agent.networks import DiscreteActions, acting_network, stochastic_policy
+from flowrep.agent import DiscreteSAC, keep_freed_memory
 from flowrep.agent.observation import store_maps
+from flowrep.config.algorithms import DiscreteSACOptions
 from flowrep.envs import StreetEnv, make_env, make_mirror
 from flowrep.envs.street_env import Episode, reward
 from flowrep.envs.torchrl_env import street_envs
@@ -143,11 +143,10 @@ def distil(
     torch.manual_seed(seed)
     env = make_env(scene, maps, num_envs=NUM_ENVS, speed=(speed[0], speed[1]), seed=seed * NUM_ENVS)
     streets = street_envs(env)
-    network = acting_network(
-        env.observation_spec, env.action_spec, maps,
-        device=torch.device("cpu"), precision="fp32", hidden_size=512, layer_norm=True,
-    )  # fmt: skip
-    student = stochastic_policy(network, maps, DiscreteActions.from_spec(env.action_spec))
+    options = DiscreteSACOptions(precision="fp32", hidden_size=512, layer_norm=True)
+    specs = env.observation_spec, env.action_spec
+    student = DiscreteSAC.make_policy(*specs, maps, options, total_frames=frames)
+    network = student[0].module
     optimizer = torch.optim.Adam(student.parameters(), 3e-4, fused=True)
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, frames // NUM_ENVS)
     memory = TensorDictReplayBuffer(storage=LazyTensorStorage(50_000), batch_size=128)

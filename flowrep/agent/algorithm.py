@@ -18,8 +18,13 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 from flowrep.agent.cuda_graph import as_cuda_graph
 from flowrep.agent.divergence import DivergenceWatch
-from flowrep.agent.networks import DiscreteActions, acting_network, stochastic_policy
-from flowrep.agent.observation import MapCodec
+from flowrep.agent.networks import (
+    DiscreteActions,
+    MapNetwork,
+    PolicyNetwork,
+    stochastic_policy,
+)
+from flowrep.agent.observation import MapCodec, compute_dtype, map_codecs
 from flowrep.agent.replay import OUTCOME, ReplayMemory
 from flowrep.config.algorithms import AlgorithmOptions, OffPolicyOptions
 
@@ -130,17 +135,15 @@ class Algorithm(ABC):
         Its `state_dict` is interchangeable with that of `policy`. The arguments are those of the
         constructor of `OffPolicy`.
         """
-        network = acting_network(
-            observation_spec,
-            action_spec,
-            keys,
-            device=torch.device(device),
-            precision=options.precision,
-            hidden_size=options.hidden_size,
-            layer_norm=getattr(options, "layer_norm", False),  # not an option of every algorithm
-        )
+        device = torch.device(device)
+        codecs = map_codecs(observation_spec, keys, compute_dtype(options.precision, device))
         actions = DiscreteActions.from_spec(action_spec)
-        return stochastic_policy(network, list(keys), actions, writes_log_prob=cls.WRITES_LOG_PROB)
+        layer_norm = getattr(options, "layer_norm", False)  # not an option of every algorithm
+        with device:
+            network = MapNetwork(codecs, options.hidden_size, actions.count, layer_norm=layer_norm)
+        return stochastic_policy(
+            PolicyNetwork(network), list(keys), actions, writes_log_prob=cls.WRITES_LOG_PROB
+        )
 
     def step_eagerly(self) -> None:
         """Runs all further updates eagerly instead of as a CUDA graph, for debugging and timing."""

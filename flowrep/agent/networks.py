@@ -21,10 +21,10 @@ from tensordict.nn import (
     TensorDictModule,
 )
 from torch import Tensor, nn
-from torchrl.data import Categorical, Composite, OneHot, TensorSpec
+from torchrl.data import Categorical, OneHot, TensorSpec
 from torchrl.modules import OneHotCategorical
 
-from flowrep.agent.observation import MapCodec, compute_dtype, map_codecs
+from flowrep.agent.observation import MapCodec
 
 EMBEDDING_SIZE = 512
 
@@ -184,24 +184,6 @@ class PolicyNetwork(nn.Module):
         stored = [codec.store(x).reshape(-1, *x.shape[-3:]) for codec, x in zip(self.codecs, maps)]
         outputs = self.network([codec.decode(x) for codec, x in zip(self.codecs, stored)])
         return outputs.reshape(*batch, outputs.shape[-1])
-
-
-def acting_network(
-    observation_spec: Composite,
-    action_spec: TensorSpec,
-    keys: Sequence[NestedKey],
-    *,
-    device: torch.device,
-    precision: str,
-    hidden_size: int,
-    layer_norm: bool = False,
-) -> PolicyNetwork:
-    """Returns the untrained network of a policy, whose arguments are those of `OffPolicy`."""
-    codecs = map_codecs(observation_spec, keys, compute_dtype(precision, device))
-    actions = DiscreteActions.from_spec(action_spec)
-    with device:
-        network = MapNetwork(codecs, hidden_size, actions.count, layer_norm=layer_norm)
-    return PolicyNetwork(network)
 
 
 def stochastic_policy(

@@ -19,8 +19,8 @@ SIZES = {
 OVERHANG = {"car": 0.03, "tree": 1.5, "fence": 0.0, "traffic_light": 0.1, "lamp_post": 1.4}
 
 
-def vertices(kind, variant=0, x=0.0, y=0.0, yaw=0.0):
-    return mesh_of(Box(kind, x, y, yaw, SIZES[kind], variant)).corners.reshape(-1, 3)
+def vertices(kind, variant):
+    return mesh_of(Box(kind, 0.0, 0.0, 0.0, SIZES[kind], variant)).corners.reshape(-1, 3)
 
 
 def normals(mesh):
@@ -54,10 +54,13 @@ def test_the_lowest_of_its_kind_stands_on_the_ground_and_has_no_face_without_are
 
 
 def test_a_shape_stands_where_its_box_does_and_faces_its_way():
-    # At (10, 3) looking along +y: 4.2 m along y, 1.8 m along x.
-    points = vertices("car", x=10.0, y=3.0, yaw=np.pi / 2)
+    # At (10, 3) looking along +y: 4.2 m along y, 1.8 m along x, and its white lamps are ahead.
+    mesh = mesh_of(Box("car", 10.0, 3.0, np.pi / 2, SIZES["car"]))
+    points = mesh.corners.reshape(-1, 3)
     assert points[:, 1].min() == pytest.approx(3.0 - 2.1, abs=0.02)
     assert points[:, 0].max() == pytest.approx(10.0 + 0.9, abs=0.03)
+    white = np.isclose(mesh.uvs, swatch("lamp_white")[:2]).all(axis=-1)
+    np.testing.assert_allclose(mesh.corners[white][:, 1], 3.0 + 2.11)
 
 
 def test_one_lamp_of_a_traffic_light_is_lit_for_those_who_drive_its_way():
