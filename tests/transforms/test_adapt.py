@@ -36,21 +36,6 @@ def test_intrinsics_of_each_sample_may_lie_under_a_key():
     torch.testing.assert_close(z[:, 0, 0, 5], torch.tensor([5.0 / math.sqrt(2), 4.0]))
 
 
-@pytest.mark.parametrize(
-    ("make", "expected"),
-    [
-        (lambda: T.AdaptDepth("ray_length"), "need K"),
-        (lambda: T.AdaptDepth("z", out_keys="depth"), "reads and writes depth: a second pass"),
-        (lambda: T.AdaptPose(axes="gl"), r"'unity'\], got 'gl'"),
-        (lambda: T.AdaptFlow(direction="forward", grid="previous"), "swap the two pictures"),
-        (lambda: T.InstanceIds([3, 1, 3]), r"body_ids.*once, got \[3, 1, 3\]"),
-    ],
-)
-def test_options_are_checked(make, expected):
-    with pytest.raises(ValueError, match=expected):
-        make()
-
-
 def test_poses_of_several_bodies_at_once():
     poses = torch.zeros(2, 3, 7)
     poses[..., 3] = 1.0

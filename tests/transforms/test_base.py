@@ -140,13 +140,6 @@ def test_values_are_checked_at_resets_of_their_own_rows_and_in_batches_but_not_i
         checks(td)
 
 
-def test_wrong_number_of_keys_is_refused():
-    with pytest.raises(ValueError, match=r"reads 3 keys .* in_keys has 1"):
-        T.RawFlow(INTRINSICS, in_keys=["depth"])
-    with pytest.raises(ValueError, match=r"writes 2 keys, out_keys has \['ego'\]"):
-        T.FlowFactorize(INTRINSICS, out_keys=["ego"])
-
-
 def test_a_transform_made_wrong_is_told_what_is_wrong():
     with pytest.raises(TypeError, match=r"MapTransform: reads are layouts.*DEPTH.*\['raw'\]"):
         T.base.MapTransform(["raw"], "raw", "out")

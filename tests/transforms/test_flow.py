@@ -223,22 +223,6 @@ def test_drift_of_odometry_leaves_no_object_flow_where_nothing_can_move(dtype):
         FlowFactorize(K, outputs=["ego"], movable="people")
 
 
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        ({"outputs": ["ego", "eggo"]}, r"\['ego', 'obj', 'raw', 'valid'\], each once"),
-        ({"outputs": ["ego", "ego"]}, "each once"),
-        ({"outputs": "ego"}, "must be a list"),
-        ({"scale": 0.0}, "scale must be a finite number other than 0"),
-        ({"scale": {"ego": 1.0}}, r"^scale needs one value for each of \['ego', 'obj'\]"),
-        ({"intrinsics": torch.eye(4)}, r"K, \[3, 3\], or the key of .*; got \[4, 4\]"),
-    ],
-)
-def test_options_are_checked(options, expected):
-    with pytest.raises(ValueError, match=expected):
-        FlowFactorize(**{"intrinsics": K, **options})
-
-
 @pytest.mark.parametrize("make", [RawFlow, FlowFactorize, partial(AdaptDepth, "ray_length")])
 def test_a_k_that_cannot_be_one_is_refused(make):
     broken = torch.tensor(INTRINSICS)

@@ -142,17 +142,3 @@ def test_specs_stay_of_their_kind():
     assert spec["d2"] == Bounded(0.0, 1.0, shape=(3, 2, 5, 7))
     assert spec["metres2"] == Unbounded((3, 2, 5, 7))
     assert spec["seg2"] == Categorical(NUM_CLASSES, shape=(3, 2, 5, 7), dtype=torch.uint8)
-
-
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        ({"k": 0}, "k must be .* 0"),
-        ({"k": 1.5}, "k must be .* 1.5"),
-        ({"out_keys": ["seg"]}, "reads and writes seg"),
-        ({"out_keys": ["a", "b"]}, "writes 1 keys"),
-    ],
-)
-def test_options_are_checked(options, expected):
-    with pytest.raises(ValueError, match=expected):
-        FrameStack(**{"in_keys": ["seg"], "out_keys": ["seg2"], **options})

@@ -73,21 +73,6 @@ def test_ids_that_uint8_can_not_hold_are_refused(ids, said):
     assert onehot[:, 0, 1].tolist() == [0, 0, 0]
 
 
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        ({"num_classes": 3, "encoding": "rgb"}, r"\['ids', 'onehot'\], got 'rgb'"),
-        ({"num_classes": 257}, "1 to 256"),
-        ({"num_classes": 2.5}, "num_classes.* 2.5"),
-        ({"range_m": math.inf}, "range_m must be a positive"),
-        ({"missing": 1.5}, r"missing must be in \[0, 1\]"),
-    ],
-)
-def test_options_are_checked(options, expected):
-    with pytest.raises(ValueError, match=expected):
-        (Segmentation if "num_classes" in options else Depth)(**options)
-
-
 def test_depth_is_clipped_and_finite():
     depth = torch.tensor([[[10.0, 50.0, -4.0], [40.0, math.inf, math.nan]]])
     got = read(Depth(range_m=40.0, missing=0.75), "depth", depth)

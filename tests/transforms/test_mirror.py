@@ -178,22 +178,6 @@ def test_a_batch_may_lack_the_next_maps_but_not_its_own():
         assert same(incomplete, before)
 
 
-@pytest.mark.parametrize(
-    ("options", "named"),
-    [
-        ({"flow_keys": "ego"}, "ego"),
-        ({"in_keys": ["raw", "raw"]}, "twice.*raw"),
-        ({"swapped_actions": [1, 2, 0]}, "swapped_actions"),
-        ({"images": "some"}, "images"),
-        ({"intrinsics": camera(2.6)}, "cx"),
-        ({"intrinsics": [[6.0, 0.1, 3.0], [0.0, 5.0, 2.1], [0.0, 0.0, 1.0]]}, "intrinsics"),
-    ],
-)
-def test_what_has_no_image_is_refused(options, named):
-    with pytest.raises(ValueError, match=named):
-        mirror(**options)
-
-
 def test_a_picture_of_another_width_than_the_camera_s_maps_is_refused():
     K = [[40.0, 0.0, 20.0], [0.0, 40.0, 20.0], [0.0, 0.0, 1.0]]
     mirror = Mirror(["seg", "rgb"], swapped_actions=SWAPPED, intrinsics=K)

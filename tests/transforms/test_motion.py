@@ -186,10 +186,3 @@ def test_an_estimate_reads_the_picture_the_prior_and_k_where_it_is_told():
     td["sensor", "rgb"] = torch.zeros(3, 3, 32, 49, dtype=torch.uint8)  # twice 16 x 24 is 32 x 48
     with pytest.raises(ValueError, match=r"one \(height, width\)"):
         estimate(td)
-
-
-def test_options_of_an_estimate_are_checked():
-    with pytest.raises(ValueError, match="outputs"):
-        EstimateCameraMotion(WIDE, outputs=["pose"])
-    with pytest.raises(ValueError, match="out_keys"):
-        EstimateCameraMotion(WIDE, out_keys=["motion"])

@@ -160,23 +160,6 @@ def test_noise_by_frame_is_in_no_state_and_the_same_at_the_root_and_under_next()
     assert not any(len(value) for value in before.values())
 
 
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        ({"sensors": ["deep"]}, r"some of \['depth', 'motion', 'flow'\], each once"),
-        ({"depth_sigma_per_m": -0.1}, "depth_sigma_per_m.* -0.1"),
-        ({"drift_m": math.inf}, "drift_m.* inf"),
-        ({"depth_dropout": 1.5}, r"depth_dropout.* 1\.5"),
-        ({"flow_sigma_px": 1.0}, "flow_sigma_px.*'flow'"),
-        ({"seed": 1.5}, "seed.* 1.5"),
-        ({"out_keys": ["only"]}, "writes 2 keys"),
-    ],
-)
-def test_options_are_checked(options, expected):
-    with pytest.raises(ValueError, match=expected):
-        SensorNoise(**options)
-
-
 def noisy_env() -> TransformedEnv:
     return TransformedEnv(FakeSensorEnv(), SensorNoise(drift_m=0.5))
 

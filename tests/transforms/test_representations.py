@@ -73,48 +73,6 @@ def test_options_reach_the_transforms():
     assert torch.equal(td["seg2"], plain["seg2"])
 
 
-@pytest.mark.parametrize(
-    ("representations", "expected"),
-    [
-        (["eggo"], r"unknown representation 'eggo'.*'depth2'"),
-        (["ego", "obj", "ego"], "'ego' is named twice"),
-        ({"depth": {"rangem": 3}}, r"'depth': 'rangem'.*'missing'"),
-        ("ego", "must be a list of names.*'ego'"),
-        ({"ego": 2.0}, r"representation 'ego' must be a mapping.*2\.0"),
-        ({"raw": {"scale": torch.ones(2)}}, "scale must be .*tensor"),
-    ],
-)
-def test_mistakes_are_explained(representations, expected):
-    with pytest.raises(ValueError, match=expected):
-        stack(representations)
-
-
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        ({"flow": "guessed"}, r"unknown source of flow 'guessed'.*\['exact', 'estimated'\]"),
-        ({"flow": {"source": "estimated", "presets": "fast"}}, "'presets'.*'preset'"),
-        ({"flow": {"source": "exact", "preset": "fast"}}, "option of exact flow: 'preset'"),
-        ({"flow": 2.5}, "unknown source of flow 2.5"),
-        ({"motion": "odometry"}, r"'odometry'.*'estimated'"),
-        ({"noise": 0.1}, "noise must be a mapping.*0.1"),
-        ({"noise": {"depth_sigma": 0.1}}, "option of noise: 'depth_sigma'.*'depth_sigma_per_m'"),
-        ({"noise": {"drift_m": -0.1}}, "drift_m must be a finite number of at least 0, got -0.1"),
-    ],
-)
-def test_options_are_checked_whether_or_not_they_are_used(options, expected):
-    with pytest.raises(ValueError, match=expected):
-        stack(["raw"], **options)
-
-
-def test_what_the_camera_has_to_say_is_asked_for():
-    with pytest.raises(ValueError, match="need num_classes="):
-        representation_stack(["seg2"])
-    with pytest.raises(ValueError, match="need intrinsics="):
-        representation_stack(["depth", "ego"], num_classes=3)
-    assert representation_stack(["depth", "rgb"])
-
-
 def test_a_missing_sensor_is_reported_under_the_name_that_was_asked_for():
     with pytest.raises(KeyError, match=r"'obj' needs key \('sensor', 'instance'\)"):
         stack(["obj"])(moments(2).exclude(("sensor", "instance")))
