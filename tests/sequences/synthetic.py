@@ -92,6 +92,13 @@ def stored(depth: np.ndarray, unit_m: float) -> np.ndarray:
     return np.rint(depth / unit_m).astype(np.uint16)
 
 
+def put_pictures(folder: Path, moments, rgb: str, depth: str, unit_m: float, names=None) -> None:
+    """Writes pictures and depth; names stand for the braces of their files' names."""
+    for name, moment in zip(names or range(len(moments)), moments):
+        put(folder / f"{rgb.format(name)}.png", moment.rgb)
+        put(folder / f"{depth.format(name)}.png", stored(moment.depth, unit_m))
+
+
 def numbers(values) -> str:
     return " ".join(repr(float(value)) for value in np.ravel(values))
 
@@ -111,11 +118,9 @@ def camera_json(**changes) -> list[str]:
 
 def write_frames(folder: Path) -> list[Moment]:
     moments = make_moments(unit_m=0.001)
-    for i, moment in enumerate(moments):
-        put(folder / f"rgb/{i:04d}.png", moment.rgb)
-        put(folder / f"depth/{i:04d}.png", stored(moment.depth, 0.001))
-        if i > 0:
-            put(folder / f"flow/{i:04d}.flo", moment.raw)
+    put_pictures(folder, moments, "rgb/{:04d}", "depth/{:04d}", 0.001)
+    for i in (1, 2):
+        put(folder / f"flow/{i:04d}.flo", moments[i].raw)
     put(folder / "poses.txt", [numbers(m.world_from_cam) for m in moments])
     put(folder / "timestamps.txt", [f"{0.1 * i}" for i in range(len(moments))])
     put(folder / "intrinsics.json", camera_json())
@@ -149,9 +154,8 @@ OPENCV_INTRINSICS = (31.0, 27.0, 18.0, 12.5)  # K, with pixel (0, 0)'s centre at
 
 def write_sevenscenes(folder: Path) -> list[Moment]:
     moments = make_moments(unit_m=0.001)
+    put_pictures(folder, moments, "frame-{:06d}.color", "frame-{:06d}.depth", 0.001)
     for i, moment in enumerate(moments):
-        put(folder / f"frame-{i:06d}.color.png", moment.rgb)
-        put(folder / f"frame-{i:06d}.depth.png", stored(moment.depth, 0.001))
         put(folder / f"frame-{i:06d}.pose.txt", map(numbers, moment.world_from_cam))
     return moments
 
@@ -160,13 +164,12 @@ def write_vkitti2(folder: Path) -> list[Moment]:
     moments = make_moments(unit_m=0.01)
     extrinsics = ["frame cameraID r1,1 r1,2 r1,3 t1 r2,1 r2,2 r2,3 t2 r3,1 r3,2 r3,3 t3 0 0 0 1"]
     intrinsics = ["frame cameraID K[0,0] K[1,1] K[0,2] K[1,2]"]
+    camera_0 = "frames/rgb/Camera_0/rgb_{:05d}", "frames/depth/Camera_0/depth_{:05d}"
+    put_pictures(folder, moments, *camera_0, 0.01)
     for i, moment in enumerate(moments):
-        frames = folder / "frames"
-        put(frames / f"rgb/Camera_0/rgb_{i:05d}.png", moment.rgb)
-        put(frames / f"depth/Camera_0/depth_{i:05d}.png", stored(moment.depth, 0.01))
         if i > 0:
             flow = vkitti_flow(-moment.raw)
-            put(frames / f"backwardFlow/Camera_0/backwardFlow_{i:05d}.png", flow)
+            put(folder / f"frames/backwardFlow/Camera_0/backwardFlow_{i:05d}.png", flow)
         cam_from_world = np.linalg.inv(moment.world_from_cam)
         for camera, shift in ((0, 0.0), (1, -0.5)):
             other = cam_from_world.copy()
@@ -280,9 +283,7 @@ def write_tartanair_v2(folder: Path) -> list[Moment]:
 def write_icl_nuim(folder: Path) -> list[Moment]:
     # Pictures begin with 0, poses with 1. Camera and world are left-handed, with y up.
     moments = make_moments(unit_m=1 / 5000)
-    for i, moment in enumerate(moments, 9):
-        put(folder / f"rgb/{i}.png", moment.rgb)
-        put(folder / f"depth/{i}.png", stored(moment.depth, 1 / 5000))
+    put_pictures(folder, moments, "rgb/{}", "depth/{}", 1 / 5000, range(9, 12))
     poses = [FLIPPED_Y @ moment.world_from_cam @ FLIPPED_Y for moment in moments]
     lines = [f"{i} {quaternion_line(pose)}" for i, pose in enumerate(poses, 9)]
     put(folder / "livingRoom2.gt.freiburg", lines[1:])
@@ -291,19 +292,16 @@ def write_icl_nuim(folder: Path) -> list[Moment]:
 
 def write_replica(folder: Path) -> list[Moment]:
     moments = make_moments(unit_m=1 / 6553.5)
-    for i, moment in enumerate(moments):
-        put(folder / f"results/frame{i:06d}.png", moment.rgb)
-        put(folder / f"results/depth{i:06d}.png", stored(moment.depth, 1 / 6553.5))
+    put_pictures(folder, moments, "results/frame{:06d}", "results/depth{:06d}", 1 / 6553.5)
     put(folder / "traj.txt", [numbers(moment.world_from_cam) for moment in moments])
     return moments
 
 
 def write_scannet(folder: Path) -> list[Moment]:
     moments = make_moments(unit_m=0.001)
+    put_pictures(folder, moments, "color/{}", "depth/{}", 0.001)
     lost = np.full((4, 4), -np.inf)
     for i, moment in enumerate(moments):
-        put(folder / f"color/{i}.png", moment.rgb)
-        put(folder / f"depth/{i}.png", stored(moment.depth, 0.001))
         put(folder / f"pose/{i}.txt", map(numbers, lost if i == 2 else moment.world_from_cam))
     camera = np.eye(4)
     camera[:3, :3] = OPENCV_K

@@ -217,17 +217,12 @@ def test_rays_are_those_of_depths_camera(moments, tmp_path):
     assert depth[12, 30] == pytest.approx(2.0 / np.hypot(1, 1 / 3), rel=1e-6)
 
 
-def test_disparity_is_depth_by_the_distance_of_two_cameras(moments, tmp_path):
-    for i, moment in enumerate(moments):
-        disparity = np.rint(256 * 31 * 0.25 / moment.depth)  # fx = 31 px, 0.25 m, in 1/256 px
-        disparity[2, 3] = 0
-        put(tmp_path / f"depth/{i:04d}.png", disparity.astype(np.uint16))
+def test_a_disparity_of_0_is_no_surface_unless_it_means_missing(moments, tmp_path):
+    put(tmp_path / "depth/0001.png", np.tile(np.uint16([[0, 31]]), (HEIGHT, WIDTH // 2)))
     options = {"depth_kind": "disparity", "baseline_m": 0.25, "depth_unit_m": 1 / 256}
     depth = open_frames(tmp_path, **options, depth_missing=[])[1].depth
-    assert depth[2, 3] == np.inf
-    depth[2, 3] = moments[1].depth[2, 3]
-    np.testing.assert_allclose(depth, moments[1].depth, rtol=0.01)
-    assert np.isnan(open_frames(tmp_path, **options)[1].depth[2, 3])
+    assert depth[0, :2].tolist() == [np.inf, 64.0]  # fx = 31 px: 31 * 0.25 / (31 / 256)
+    assert np.isnan(open_frames(tmp_path, **options)[1].depth[0, 0])
     with pytest.raises(ValueError, match="baseline_m"):
         open_frames(tmp_path, depth_kind="disparity")[1]
 

@@ -231,19 +231,17 @@ def test_a_pipe_is_refused_and_not_waited_for(name, tmp_path):
         signal.signal(signal.SIGALRM, previous)
 
 
-def test_an_hdf5_file_is_its_only_array(tmp_path):
+def test_an_hdf5_file_of_two_arrays_or_none_is_refused(tmp_path):
     h5py = pytest.importorskip("h5py", reason="pip install 'flowrep-rl[hdf5]'")
-    moments = synthetic.write_frames(tmp_path)
-    u_and_v, depth = moments[1].raw.transpose(1, 2, 0), moments[1].depth
-    for file, key, array in (("flow/0001.flo5", "flow", u_and_v), ("depth/0001.h5", "a/z", depth)):
-        next(tmp_path.glob(f"{file.partition('.')[0]}.*")).unlink()
-        with h5py.File(tmp_path / file, "w") as stored:
-            stored[key] = array
-    frame = sequences.open_recording(tmp_path, "frames")[1]
-    np.testing.assert_array_equal(frame.raw, moments[1].raw)
-    np.testing.assert_array_equal(frame.depth, depth)
-    with h5py.File(tmp_path / "depth/0001.h5", "a") as stored:
-        stored["b"] = array
+    depth = synthetic.write_frames(tmp_path)[1].depth
+    (tmp_path / "depth/0001.png").unlink()
+    for names in (["a/z"], ["a/z", "b"]):
+        with h5py.File(tmp_path / "depth/0001.h5", "w") as stored:
+            for name in names:
+                stored[name] = depth
+        if len(names) == 1:
+            read = sequences.open_recording(tmp_path, "frames")[1].depth
+            np.testing.assert_array_equal(read, depth)
     assert "2 arrays" in refusal(lambda: sequences.open_recording(tmp_path, "frames"), "0001.h5")
     (tmp_path / "depth/0001.h5").write_bytes(b"no HDF5")
     refusal(lambda: sequences.open_recording(tmp_path, "frames"), "0001.h5")

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from flowrep.sequences import SequenceError, open_recording
 from tests.sequences import synthetic
-from tests.sequences.synthetic import HEIGHT, WIDTH, K, make_moments, numbers, put, stored
+from tests.sequences.synthetic import HEIGHT, WIDTH, K, make_moments, numbers, put
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 OPENCV_K = synthetic.OPENCV_K
@@ -138,10 +138,8 @@ TOOLS = {
 def write(name, folder):
     tool, rgb, depth, _ = TOOLS[name]
     moments = make_moments(unit_m=0.001)
-    for i, moment in enumerate(moments):
-        number = f"{100 + i / 60:.3f}" if name == "arkitscenes" else i
-        put(folder / f"{rgb.format(number)}.png", moment.rgb)
-        put(folder / f"{depth.format(number)}.png", stored(moment.depth, 0.001))
+    times = [f"{100 + i / 60:.3f}" for i in range(3)] if name == "arkitscenes" else None
+    synthetic.put_pictures(folder, moments, rgb, depth, 0.001, times)
     tool(folder, moments)
     return moments
 
