@@ -172,21 +172,8 @@ camera_matrix:
 distortion_model: plumb_bob
 distortion_coefficients: {{rows: 1, cols: 5, data: {LENS}}}
 """
-OPENCV = f"""%YAML:1.0
----
-image_width: {WIDTH}
-image_height: {HEIGHT}
-camera_matrix: !!opencv-matrix
-   rows: 3
-   cols: 3
-   dt: d
-   data: {OPENCV_K.ravel().tolist()}
-distortion_coefficients: !!opencv-matrix
-   rows: 5
-   cols: 1
-   dt: d
-   data: {LENS}
-"""
+TAG = " !!opencv-matrix"
+OPENCV = "%YAML:1.0\n---" + ROS.replace("_matrix:", f"_matrix:{TAG}").replace("s: {", f"s:{TAG} {{")
 COLMAP = f"1 OPENCV {WIDTH} {HEIGHT} 31 27 18.5 13 {numbers(LENS[:4])}"
 NERF = {"fl_x": 31, "fl_y": 27, "cx": 18.5, "cy": 13, "w": WIDTH, "h": HEIGHT}
 NERF_FISHEYE = {"camera_model": "OPENCV_FISHEYE", **dict(zip(("k1", "k2", "k3", "k4"), LENS))}
