@@ -52,7 +52,7 @@ def run(config: EvaluateConfig) -> None:
     with StopRequest() as stop:
         for candidate in candidates:
             try:
-                with candidate.folder.held():
+                with candidate.folder.locked():
                     evaluate_one(config, candidate, evaluations, stop)
             except Exception as error:
                 if len(candidates) == 1 or not is_a_mistake(error):

@@ -128,7 +128,6 @@ def job(config: DictConfig) -> None:
             state = attempted(
                 folder, asked, log,
                 lambda: stopped.exists() or (is_worker and os.getppid() != PARENT),
-                typed=list(hydra.overrides.task),
                 settings=settings_of(hydra.runtime.choices),
             )  # fmt: skip
         except Exception as error:  # the other runs go on

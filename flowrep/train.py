@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Iterable
 from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
@@ -56,17 +55,16 @@ def run(config: TrainConfig) -> None:
     from flowrep.experiment.run import RunFolder
 
     job = HydraConfig.get()
-    typed = list(job.overrides.task)
     if config.resume is not None:
         folder = RunFolder.existing(config.resume)
-        with folder.held(PATIENCE_S):
-            run_in_folder(resumed(config, folder, typed), folder)
+        with folder.locked(PATIENCE_S):
+            run_in_folder(resumed(config, folder, list(job.overrides.task)), folder)
         return
     folder = RunFolder(job.runtime.output_dir)
-    with folder.held():
+    with folder.locked():
         folder.check_is_new()
         announce(config, settings_of(job.runtime.choices))
-        run_in_folder(config, folder, typed)
+        run_in_folder(config, folder)
 
 
 def run_sweep_job() -> None:
@@ -76,7 +74,7 @@ def run_sweep_job() -> None:
     try:
         asked = json.load(sys.stdin)
         config, folder = validated(TrainConfig, asked["config"]), RunFolder(asked["folder"])
-        with folder.held(PATIENCE_S):
+        with folder.locked(PATIENCE_S):
             if folder.config_path.is_file():
                 machine = {key: getattr(config, key) for key in OF_THE_MACHINE}
                 stored = folder.config(config.trusted)
@@ -84,7 +82,7 @@ def run_sweep_job() -> None:
             else:
                 folder.check_is_new()
                 announce(config, asked["settings"])
-            run_in_folder(config, folder, asked["typed"])
+            run_in_folder(config, folder)
     except Exception as error:
         end_with(error)
 
@@ -96,6 +94,7 @@ def resumed(config: TrainConfig, folder: RunFolder, typed: list[str]) -> TrainCo
     trusted = "algorithm._target_"
     classes = [k for k in given if re.fullmatch(r"(algorithm|representations\.\w+)\._target_", k)]
     stored = folder.config(config.trusted if classes else ())
+    # What the weights depend on is stored. Only the machine and the length may change.
     allowed = (*OF_THE_MACHINE, "total_frames", trusted)
     if others := [key for key in given if key not in (*allowed, *classes)]:
         raise UsageError(
@@ -143,7 +142,7 @@ def announce(config: TrainConfig, settings: str) -> None:
         )
 
 
-def run_in_folder(config: TrainConfig, folder: RunFolder, typed: Iterable[str] = ()) -> None:
+def run_in_folder(config: TrainConfig, folder: RunFolder) -> None:
     """Runs what remains of a run: training, evaluation, film.
 
     Its config is written once everything could be built: what fails before leaves no run behind.
@@ -157,7 +156,7 @@ def run_in_folder(config: TrainConfig, folder: RunFolder, typed: Iterable[str] =
     how_to_go_on = line_for("train", resume=str(folder.path))
     with StopRequest() as stop, closing(Runner(config, folder)) as runner:
         if config.resume is None:
-            folder.begin(runner.config, typed)
+            folder.write_config(runner.config.plain())
         else:
             runner.load()
             folder.lengthen(config.total_frames)

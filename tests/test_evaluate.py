@@ -39,7 +39,7 @@ def saved(path, *overrides):
     config = composed("debug=smoke", "device=cpu", SHORT, *overrides)
     folder = RunFolder(path)
     runner = Runner(config, folder)
-    folder.begin(runner.config, overrides)
+    folder.write_config(runner.config.plain())
     runner.observation = runner.env.reset()
     runner.save()
     runner.close()
@@ -185,7 +185,7 @@ def test_the_runs_of_a_sweep_are_evaluated_on_the_same_episodes(some, monkeypatc
 @pytest.mark.parametrize("trouble", ["it can not be saved", "it is in use"])
 def test_a_run_in_trouble_costs_no_other_its_episodes(some, capsys, trouble):
     folders, config = some("good_1", "good_2")
-    in_use = folders[0].held() if trouble == "it is in use" else nullcontext()
+    in_use = folders[0].locked() if trouble == "it is in use" else nullcontext()
     if trouble == "it can not be saved":
         (folders[0].path / "evaluation.csv").mkdir()
     with in_use, pytest.raises(SystemExit) as ended:
@@ -197,7 +197,7 @@ def test_a_run_in_trouble_costs_no_other_its_episodes(some, capsys, trouble):
     assert errors
     assert all(str(folders[0].path) in line for line in errors)
     assert str(folders[1].evaluation_path) in said.out
-    with folders[1].held():  # its lock is free again
+    with folders[1].locked():  # its lock is free again
         pass
 
 

@@ -186,7 +186,7 @@ def test_no_file_of_a_run_is_written_through_a_link(tmp_path, victim, name, is_t
 def test_a_run_with_a_link_in_place_of_what_it_writes_does_not_begin(tmp_path, victim, name):
     run, before = RunFolder(tmp_path), victim.read_text()
     (run.path / name).symlink_to(victim if name == ".lock" else victim.parent)
-    with pytest.raises(OSError, match=name), run.held():
+    with pytest.raises(OSError, match=name), run.locked():
         pass
     assert victim.read_text() == before
     assert os.listdir(victim.parent) == ["victim"]

@@ -109,11 +109,8 @@ def _composing(typed: Sequence[str]) -> Iterator[None]:
         raise UsageError(text) from error
 
 
-def composed(schema: type[Model], values: Mapping[str, Any]) -> tuple[Model, str, list[str]]:
-    """Returns the config of a training with these values, for use in Python.
-
-    Also returns the folder that `flowrep.train` would choose, and the values as overrides.
-    """
+def composed(schema: type[Model], values: Mapping[str, Any]) -> tuple[Model, str]:
+    """Returns the config of a training from Python, and the folder that `flowrep.train` takes."""
     typed = list(_overrides(values))
     outer = get_gh_backup()  # of the script that calls, which may use Hydra itself
     GlobalHydra.instance().clear()
@@ -123,7 +120,7 @@ def composed(schema: type[Model], values: Mapping[str, Any]) -> tuple[Model, str
             hydra.initialize_config_dir(str(CONF_DIR), version_base="1.3"),
         ):
             config = hydra.compose("train", typed, return_hydra_config=True)
-            return checked(config, schema), str(config.hydra.run.dir), typed
+            return checked(config, schema), str(config.hydra.run.dir)
     finally:
         restore_gh_from_backup(outer)
 
@@ -151,9 +148,11 @@ def checked(config: DictConfig, schema: type[Model]) -> Model:
     model: Any = validated(schema, plain)
     _check_no_file_is_hidden(job)
     typed = job.overrides.task
+    # The schema keeps unknown keys for who adds one by `+note=pilot`, not for a file's typo.
     keys = [text.partition("=")[0].rpartition("@")[2] for text in typed]  # +group@key=choice
     for key in (model.model_extra or {}).keys() - {key.lstrip("+").split(".")[0] for key in keys}:
         raise UsageError(f"{key}: there is no such key; do you mean one of its sections'?")
+    # Wherever it was typed: as a value, in a section or in a list.
     words = {word for text in typed if "_target_" in text for word in re.split(r"[^\w.]", text)}
     for key, target in model.classes.items():
         if target not in (*ALGORITHMS, *words):
@@ -253,6 +252,7 @@ def as_typed(arguments: Sequence[str], schema: type[Command]) -> list[str]:
     folders, others, previous = [], [], ""
     for text in arguments:
         key, _, value = text.partition("=")
+        # Neither a flag nor the value of one, as of `--config-dir mine`.
         is_argument = text[:1] not in "-~+" and not previous.startswith("-")
         if is_argument and "run" in schema.model_fields and (text == key or Path(text).exists()):
             folders.append(override("run", text).removeprefix("run="))

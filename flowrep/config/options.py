@@ -29,6 +29,7 @@ CLASS = r"^\w+(\.\w+)+$"  # package.module.Class
 def _distinct(values: Any) -> Any:
     if isinstance(values, tuple):  # from Python; a config has lists
         values = [*values]
+    # Not by a set: a wrong value may be a list, which has no hash.
     if isinstance(values, list) and any(x in values[:i] for i, x in enumerate(values)):
         raise ValueError("a value is repeated")
     return values
@@ -42,6 +43,7 @@ OneOrMore = BeforeValidator(lambda x: x if isinstance(x, list) or x is None else
 class Options(BaseModel):
     """Named values: unknown names are refused, types are strict, and values can't be changed."""
 
+    # Strict, as pydantic would take "1" and true for the number 1.
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
     def plain(self) -> dict[str, Any]:

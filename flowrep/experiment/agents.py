@@ -60,17 +60,17 @@ class Agent(Driver):
         """
         if "resume" in overrides:
             raise UsageError("resume=: continue a run with python -m flowrep.train resume=<folder>")
-        config, default, typed = composed(TrainConfig, overrides)
+        config, default = composed(TrainConfig, overrides)
         build.check(config)
         run = RunFolder(default if folder is None else folder)
         run.check_is_new()
         with (
-            run.held(),
+            run.locked(),
             StopRequest() as stop,
             torch_threads(torch.get_num_threads()),  # the caller's again afterwards
             closing(Runner(config, run, on_log=callback)) as runner,
         ):
-            run.begin(runner.config, typed)
+            run.write_config(runner.config.plain())
             runner.train(stop)
         if stop:
             raise KeyboardInterrupt(f"stopped after {runner.frames} frames; saved in {run.path}")

@@ -65,6 +65,7 @@ def training(config: TrainConfig) -> tuple[TrainConfig, EnvBase, Algorithm]:
     share_cores(config)
     torch.manual_seed(config.seed)
     streets = env(config, compiled=config.compiled)
+    # Env i draws its episodes from seed · num_envs + i: runs of two seeds share none.
     streets.set_seed(config.seed * config.num_envs)
     # TorchRL's storage starts multiprocessing's resource tracker, which a SIGHUP would end.
     with sheltered():

@@ -65,6 +65,7 @@ class Driver:
             "scene_id": scene_id(scene),
             "representations": "+".join(self.config.representations),
             "flow": self.config.flow.source,
+            # Without a training, the config's seed is the default of conf/ and says nothing.
             "seed": self.config.seed if self.frames else "",
             "frames": self.frames,
             "evaluation": evaluation,
@@ -271,6 +272,7 @@ class PairedEvaluation:
         on_frame: Callable[[TensorDictBase], Any],
     ) -> Iterator[EpisodeRecord]:
         """Yields the missing episodes."""
+        # An env has one frame rate; its pedestrians' speed changes from episode to episode.
         for rate in self.fps:
             own = _BLIND if isinstance(policy, str) else {}  # the policy itself may be a baseline
             for names, changes in ((self.policies, own), (self.baselines, _BLIND)):

@@ -86,6 +86,7 @@ class Film:
         policy = agent.policy
         self.policy = BaselinePolicy(policy, self.env) if isinstance(policy, str) else policy
         self.tiles = stock_tiles()
+        # Appended behind the agent's transforms, these read the sensors as they are, without noise.
         if exact := [name for name in self.tiles if name not in (*read, "rgb")]:
             K, num_classes = torch.from_numpy(self.street.K), self.street.num_classes
             stack = representation_stack(exact, intrinsics=K, num_classes=num_classes)

@@ -41,7 +41,7 @@ def policy_of(name: str | Path) -> NamedPolicy:
     """Returns what `policy=` names; raises UsageError if that is nothing."""
     name = str(name)
     if name in get_args(BaselineName):
-        return Baseline(name)
+        return NamedBaseline(name)
     if Path(name).is_dir():  # its name may hold a colon
         return RunPolicy(name)
     if name == "pretrained" or name.endswith(".safetensors"):
@@ -80,7 +80,7 @@ class NamedPolicy:
         return given | ({"scene": load_scene(given["scene"])} if "scene" in given else {})
 
 
-class Baseline(NamedPolicy):
+class NamedBaseline(NamedPolicy):
     """A policy that reads the simulator's state and sees no map, such as the planner."""
 
     def load(self, env: Mapping[str, Any], trusted: Collection[str], precision: Any) -> Loaded:
@@ -110,6 +110,8 @@ class TrainedPolicy(NamedPolicy):
         if not isinstance(state["frames"], int):
             raise CheckpointError(f"{path} is a checkpoint, but not of an agent")
         if "scene" in given:
+            # What the network sees must keep its meaning: flow in pixels depends on the camera, a
+            # class id on the scene's categories.
             seen: dict[str, Any] = {"camera": trained.scene.camera}
             if not {"seg", "seg2"}.isdisjoint(trained.representations):
                 seen["categories"] = trained.scene.categories
@@ -235,11 +237,11 @@ def _env_config(given: Mapping[str, Any]) -> EnvConfig:
     if isinstance(maps, str):
         raise UsageError(f"representations: give a list, ['{maps}']")
     if isinstance(maps, Mapping):
-        defaults, _, _ = composed(TrainConfig, {})
+        defaults, _ = composed(TrainConfig, {})
         options = {name: _whole_options(name) | (maps[name] or {}) for name in maps}
         given = {**given, "representations": options or defaults.representations}
     else:
-        defaults, _, _ = composed(TrainConfig, {"representations": [*maps]})
+        defaults, _ = composed(TrainConfig, {"representations": [*maps]})
         given = {**given, "representations": defaults.representations}
     return validated(
         EnvConfig, {key: getattr(defaults, key) for key in EnvConfig.model_fields} | given

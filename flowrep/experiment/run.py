@@ -106,7 +106,7 @@ class RunFolder:
                 )
 
     @contextmanager
-    def held(self, patience_s: float = 0.0) -> Iterator[None]:
+    def locked(self, patience_s: float = 0.0) -> Iterator[None]:
         """Creates the folder, and locks it against other processes until the context ends.
 
         The kernel ends the lock with the process, even if that is killed. Another process may take
@@ -114,7 +114,7 @@ class RunFolder:
         """
         self.path.mkdir(parents=True, exist_ok=True)
         # In a stranger's folder: TensorBoard and FFmpeg would write through them.
-        for name in (".lock", "checkpoint", "tensorboard", "videos", ".hydra"):
+        for name in (".lock", "checkpoint", "tensorboard", "videos"):
             refuse_link(self.path / name)
         lock = FileLock(self.path / ".lock")
         try:
@@ -132,13 +132,6 @@ class RunFolder:
     def video_path(self, name: str) -> Path:
         """Returns the path of the video with this name."""
         return self.path / "videos" / f"{name}.mp4"
-
-    def begin(self, config: TrainConfig, overrides: Iterable[str]) -> None:
-        """Writes a new run's config and overrides."""
-        (self.path / ".hydra").mkdir(parents=True, exist_ok=True)  # where Hydra keeps the overrides
-        typed = yaml.safe_dump(list(overrides), allow_unicode=True)
-        replace_text(self.path / ".hydra" / "overrides.yaml", typed)
-        self.write_config(config.plain())
 
     def lengthen(self, total_frames: int) -> None:
         """Writes to a run's config that it is longer, unless it says so already."""

@@ -262,6 +262,7 @@ class Runner:
         self.agent.load_state_dict(state["agent"])
         self.agent.memory.load_state_dict(state["memory"])
         set_states(env, state["env"])
+        # Last, so that nothing above moves the generators from where they stood.
         torch.set_rng_state(state["torch_rng"])
         if len(state["cuda_rng"]) == torch.cuda.device_count():
             torch.cuda.set_rng_state_all(state["cuda_rng"])

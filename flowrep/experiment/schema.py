@@ -80,6 +80,7 @@ class ForeignAlgorithm(AlgorithmOptions):
 
 def _tag(section: Any) -> str:
     """Returns the tag of an algorithm's section in the union `Algorithm`."""
+    # A class that is none of flowrep's checks its options itself, once it may be imported.
     plain = section.plain() if isinstance(section, AlgorithmOptions) else section
     target = plain.get("_target_") if isinstance(plain, Mapping) else None
     return target if isinstance(target, str) and target in ALGORITHMS else "a user's"

@@ -70,6 +70,7 @@ class Run:
         self.speed = str(config["speed"])  # of the pedestrians in training
         self.fps = float(scene["frame_rate_hz"])
         self.total_frames = int(config["total_frames"])
+        # Rows of metrics come at intervals, so the last frames may have left episodes alone.
         columns = (self.metrics.get("frames", np.zeros(0)), self.episodes["frames"])
         self.frames = max((int(c.max()) for c in columns if len(c)), default=0)
         self.is_trained = self.frames >= self.total_frames  # to the end; perhaps not evaluated yet
@@ -242,6 +243,7 @@ def groups_of(runs: Sequence[Run]) -> list[Group]:
 def _has_key(run: Run, key: str) -> bool:
     section, _, rest = key.partition(".")
     name = rest.split(".")[0]
+    # A run without a map can't differ in its options, nor one scene in the layout of another.
     if section == "representations":
         return name in run.config[section]
     return section != "scene" or name in (*_SHARED_SCENE_KEYS, run.scene)

@@ -103,6 +103,7 @@ def flow_wheel(size_px: int) -> Image:
     axis = np.linspace(-1, 1, size_px, dtype=np.float32)
     u, v = np.meshgrid(axis, axis)
     disc = flow_to_rgb(np.stack([u, v]), scale_px=1.0)
+    # Half a pixel beyond the rim, which would be ragged otherwise.
     disc[np.hypot(u, v) > 1 + 1 / size_px] = 255
     return disc
 

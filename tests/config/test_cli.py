@@ -338,13 +338,13 @@ def test_a_misspelt_choice_of_an_optional_group_is_refused(group):
 
 def test_a_mapping_of_representations_is_the_whole_stack():
     values = {"debug": "smoke", "representations": {"obj": {"scale": 0.5}}}
-    config, _, _ = cli.composed(SCHEMAS["train"], values)
+    config, _ = cli.composed(SCHEMAS["train"], values)
     assert {name: of["scale"] for name, of in config.representations.items()} == {"obj": 0.5}
 
 
 def test_a_config_can_be_composed_in_a_script_that_uses_hydra_itself(tmp_path):
     with initialize_config_dir(str(tmp_path), version_base="1.3"):
-        config, _, _ = cli.composed(SCHEMAS["train"], {"debug": "smoke"})
+        config, _ = cli.composed(SCHEMAS["train"], {"debug": "smoke"})
         assert config.total_frames > 0
         assert GlobalHydra.instance().is_initialized()
     assert not GlobalHydra.instance().is_initialized()
