@@ -181,7 +181,8 @@ class DeclaredRecording(Recording):
 
     def _listing(self, pattern: str, kind: str) -> tuple[dict[str, Path], Floats | None]:
         """Returns files by the names of their frames, and their times if these are needed."""
-        path, is_timed = self._path(pattern), "time" in (self.depth_by, self.rows_by)
+        path, by_times = self._path(pattern), self.rows_by == "time" and not self._times
+        is_timed = by_times or self.depth_by == "time"
         try:
             if "*" in pattern:
                 found = files.find_files(path, kind)
@@ -207,7 +208,7 @@ class DeclaredRecording(Recording):
     # Tables, and which rows belong to which frames.
 
     def _table(
-        self, sources: Sequence[str], columns: Sequence[int] | None = None
+        self, sources: Sequence[str], columns: Sequence[int] | None, by: str
     ) -> tuple[Floats, Indices, Floats]:
         """Returns a table's columns, each frame's row before and after it, and the share between.
 
@@ -225,15 +226,16 @@ class DeclaredRecording(Recording):
                     raise SequenceError(path, f"has {size} numbers, others {sizes[0]}")
             table = np.concatenate(parts)
         else:
-            key = None if self.rows_by == "order" else self.key
-            table, keys = files.read_table(path, key if isinstance(key, int) else None)
+            key = None if by == "order" else self.key
+            at = key if isinstance(key, int) else None
+            table, keys = files.read_table(path, at, named=by == "name")
             others = [files.read_table(self._path(source))[0] for source in sources[1:]]
             if any(len(other) != len(table) for other in others):
                 raise SequenceError(path, f"has {len(table)} rows, {sources[1:]} another number")
             table = np.hstack([table, *others])
             if isinstance(key, str):
                 keys = np.ravel(files.read_json(self._path(key)))
-            elif key is None and self.rows_by != "order":
+            elif key is None and by != "order":
                 keys = np.arange(len(table))
         if self.rows_where is not None:
             try:
@@ -248,11 +250,11 @@ class DeclaredRecording(Recording):
         if not len(table) or not 0 <= first < end <= table.shape[1]:
             size = f"{len(table)} rows of {table.shape[1]}"
             raise SequenceError(path, f"has {size} numbers, expected {max(end, first + 1)}")
-        return table[:, first:end], *self._match(path, keys, len(table))
+        return table[:, first:end], *self._match(path, keys, len(table), by)
 
-    def _match(self, path: Path, keys: Any, count: int) -> tuple[Indices, Floats]:
+    def _match(self, path: Path, keys: Any, count: int, by: str) -> tuple[Indices, Floats]:
         """Returns the rows around each frame, and the share between; see `_table`."""
-        by, rows = self.rows_by, np.arange(len(self._names))
+        rows = np.arange(len(self._names))
         if keys is None:
             if count != len(rows):
                 raise SequenceError(path, f"has {count} rows for {len(rows)} frames")
@@ -274,8 +276,10 @@ class DeclaredRecording(Recording):
     def _read_times(self) -> LeftOut:
         if not self._times:
             return {}
+        # By times, other tables belong to frames, but not the table of the frames' times itself.
+        by = "order" if self.rows_by == "time" else self.rows_by
         # Rows in the frames' order hold a time alone; others begin with one.
-        table, (rows, _), _ = self._table(self._times, None if self.rows_by == "order" else (0, 1))
+        table, (rows, _), _ = self._table(self._times, None if by == "order" else (0, 1), by)
         if table.shape[1] > 1:
             says = f"has {table.shape[1]} numbers in a row, expected one: seconds, with a point"
             raise SequenceError(self._path(self._times[0]), says)
@@ -287,7 +291,7 @@ class DeclaredRecording(Recording):
         if not self.has_poses:
             return {}
         path = self._path(self._pose_files[0])
-        numbers, rows, share = self._table(self._pose_files, self.pose_columns)
+        numbers, rows, share = self._table(self._pose_files, self.pose_columns, self.rows_by)
         names = "layout", "direction", "axes"
         options: Any = {name: getattr(self, f"pose_{name}") for name in names}
         poses = as_pose(numbers, path, check=False, **options)
@@ -323,7 +327,7 @@ class DeclaredRecording(Recording):
                 self.distortion, self.lens = camera.distortion, camera.lens
         lacking = np.zeros(len(self._names), dtype=bool)
         if isinstance(given, str) and ("*" in given or self.intrinsics_columns is not None):
-            numbers, (rows, _), _ = self._table([given], self.intrinsics_columns)
+            numbers, (rows, _), _ = self._table([given], self.intrinsics_columns, self.rows_by)
             numbers, lacking = numbers[rows], rows < 0
         else:
             numbers = self._numbers_in(given)

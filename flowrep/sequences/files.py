@@ -109,18 +109,20 @@ def read_lines(path: Path) -> list[str]:
     return [line for line in lines if line and not line.startswith("#")]
 
 
-def read_table(path: Path, key: int | None = None) -> tuple[NDArray[np.float64], Any]:
+def read_table(
+    path: Path, key: int | None = None, *, named: bool = False
+) -> tuple[NDArray[np.float64], Any]:
     """Returns the numbers of a file, a row a line, and what stands in the column `key` instead.
 
-    They are separated by blanks or commas. A line that begins with a word is a header; if the key
-    is a word (a picture's name), lines without one, as COLMAP's lines of points, are no rows.
-    `file.txt:key` is the line `key: numbers`; for JSON see `read_json`. An array of HDF5 has a row
-    for each index of its first axis. Sintel's `.cam` is one row, K and the extrinsics; a pose of
-    Open3D's `.log` is four lines after one of other numbers.
+    They are separated by blanks or commas. A first line that begins with a word is a header. If
+    rows are `named`, the key is a word, and lines without one, as COLMAP's lines of points, are no
+    rows. `file.txt:key` is the line `key: numbers`; for JSON see `read_json`. An array of HDF5 has
+    a row for each index of its first axis. Sintel's `.cam` is one row, K and the extrinsics; a pose
+    of Open3D's `.log` is four lines after one of other numbers.
     """
     # The name of a file may hold a colon, e.g. a time's.
     file, _, line = (path.name, "", "") if path.exists() else path.name.partition(":")
-    suffix, words = Path(file).suffix.lower(), None
+    suffix, names = Path(file).suffix.lower(), None
     try:
         if suffix == ".json" or suffix in _HDF5:
             array = np.array(read_json(path) if suffix == ".json" else read_array(path), np.float64)
@@ -135,23 +137,21 @@ def read_table(path: Path, key: int | None = None) -> tuple[NDArray[np.float64],
             elif suffix == ".log":
                 lines = [" ".join(lines[i + 1 : i + 5]) for i in range(0, len(lines), 5)]
             rows = [text.split() for text in lines]
-            if rows and not _NUMBER.fullmatch(rows[0][0]):
+            if named and key is not None:
+                rows = [x for x in rows if len(x) > key and not _NUMBER.fullmatch(x[key])]
+                names = [row.pop(key) for row in rows]
+            elif rows and not _NUMBER.fullmatch(rows[0][0]):
                 del rows[0]
-            if key is not None and any(_is_word(row, key) for row in rows[:2]):
-                rows = [row for row in rows if _is_word(row, key)]
-                words, key = [row.pop(key) for row in rows], None
             table = np.array(rows, np.float64)
-        if key is not None:
+        if named and names is None and key is not None:
+            raise ValueError("it has no column of names")
+        if key is not None and names is None:
             return np.delete(table, key, 1), table[:, key]
     except UNREADABLE as error:
         raise SequenceError(path, f"holds no table of numbers: {error}") from None
     if not table.size:
         raise SequenceError(path, "holds no numbers")
-    return table, words
-
-
-def _is_word(row: list[str], column: int) -> bool:
-    return len(row) > column and not _NUMBER.fullmatch(row[column])
+    return table, names
 
 
 def read_json(path: Path) -> Any:

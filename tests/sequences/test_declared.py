@@ -140,6 +140,18 @@ def test_depth_of_other_names_is_matched_by_its_order(moments, tmp_path):
         open_frames(tmp_path, depth_by="order")
 
 
+@pytest.mark.parametrize("by", ["time", "name"])
+def test_poses_by_the_times_of_a_table_or_by_names_that_come_first(by, moments, tmp_path):
+    # Times in timestamps.txt are 0, 0.1 and 0.2 s, whatever the pictures' names are.
+    keys = [f"{name}.png" for name in FRAMES] if by == "name" else [0.0, 0.101, 0.199]
+    poses = [f"{k} {numbers(m.world_from_cam)}" for k, m in zip(keys, moments)]
+    put(tmp_path / "poses.txt", poses[::-1] if by == "name" else poses)
+    times = None if by == "name" else "timestamps.txt"
+    recording = open_frames(tmp_path, rows_by=by, times=times)
+    for frame, moment in zip(recording, moments, strict=True):
+        np.testing.assert_allclose(frame.world_from_cam, moment.world_from_cam)
+
+
 def test_frames_may_be_left_out_by_name(moments, tmp_path):
     recording = open_frames(tmp_path, leave_out=["0001"])
     assert [frame.name for frame in recording] == ["0000", "0002"]
@@ -358,6 +370,7 @@ def test_brackets_in_a_name_are_brackets(moments, tmp_path):
         ({"poses": ["depth/*", "poses.txt"]}, r"depth/\*: is a file per frame"),
         ({"depth_intrinsics": [0.0, 0.0, 18.5, 13.0]}, r"format\.depth_intrinsics"),
         ({"rows_by": "number", "key": 99}, r"timestamps\.txt.* 99"),
+        ({"rows_by": "name", "poses": "intrinsics.json:fx", "times": None}, "no column of names"),
         ({"rows_where": [99, 0]}, r"format\.rows_where.*timestamps\.txt.* 99"),
         ({"rows_where": ["first", 0]}, r"format\.rows_where"),
         ({"rows_where": [0]}, r"format\.rows_where"),
