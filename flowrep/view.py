@@ -23,7 +23,7 @@ from flowrep.config.folders import folder_name
 from flowrep.config.usage import UsageError
 from flowrep.experiment.policies import policy_of
 from flowrep.experiment.schema import ViewConfig
-from flowrep.files import write_rows
+from flowrep.files import replace_file, write_rows
 from flowrep.progress import progress_bar
 from flowrep.viz import contact_sheet, write_png, write_video
 
@@ -109,14 +109,15 @@ def view(config: ViewConfig, agent: Agent, film: Film) -> None:
     origin = agent.origin("view") | {"policy": config.policy}
     rows = [replace(each, **origin).row() for each in episodes]
     folder.mkdir(parents=True, exist_ok=True)
-    for name in FILES:  # of an earlier view, which may have had a film
-        (folder / name).unlink(missing_ok=True)
     chosen = moments([moving_pixels(frame.maps) for frame in frames], config.sheet_rows)
     write_png(folder / "sheet.png", contact_sheet(film.draw(frames[i]) for i in chosen))
     if config.video:
         pictures = progress_bar(film.pictures(frames, episode), what="drawing", unit="frame")
         write_video(folder / "episode.mp4", pictures, fps=episode.fps)
-    draw_plan(Layout(scene), tracks, path=path).savefig(folder / "plan.png", dpi=110)
+    else:  # an earlier view may have had one
+        (folder / "episode.mp4").unlink(missing_ok=True)
+    with replace_file(folder / "plan.png") as partial:
+        draw_plan(Layout(scene), tracks, path=path).savefig(partial, dpi=110)
     write_rows(folder / "episodes.csv", rows)
     shown = ("path", "episode_seed", "outcome", "hit", "return", "length")
     print_table("episodes", [{name: row[name] for name in shown} for row in rows])

@@ -32,6 +32,7 @@ from flowrep.sequences.output import Output
 from tests.config.composing import plain
 from tests.sequences import synthetic
 from tests.sequences.synthetic import SEVEN_SCENES, needs_7scenes
+from tests.test_files import fails
 
 
 def settings(*overrides) -> FactorizeConfig:
@@ -55,6 +56,12 @@ def files_of(folder):
 @pytest.fixture
 def moments(tmp_path):
     return synthetic.write_frames(tmp_path / "in")
+
+
+def test_a_full_disk_is_named(moments, tmp_path, monkeypatch):
+    monkeypatch.setattr("flowrep.sequences.output.write_flo", fails)
+    with pytest.raises(OSError, match=r"free some space.*out\.partial"):
+        factorize(tmp_path)
 
 
 def test_all_that_is_written(moments, tmp_path):

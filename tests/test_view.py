@@ -9,6 +9,7 @@ import torch
 
 pytest.importorskip("pybullet", reason="the command needs the simulator")
 
+from flowrep import files
 from flowrep.config.options import validated
 from flowrep.config.usage import UsageError
 from flowrep.experiment.film import Film
@@ -27,6 +28,7 @@ from flowrep.view import (
     view,
 )
 from tests.config.composing import plain
+from tests.test_files import fails
 
 SMALL = ["scene.camera.height_px=24", "scene.camera.width_px=32", "episodes=2", "sheet_rows=2"]
 
@@ -113,6 +115,15 @@ def test_a_view_replaces_the_files_of_an_earlier_one_and_no_others(tmp_path):
     assert [path.name for path in tmp_path.iterdir() if path.read_bytes() == b"old"] == [
         "notes.txt"
     ]
+
+
+def test_a_view_for_which_the_disk_has_no_room_leaves_an_earlier_one(tmp_path, monkeypatch):
+    for name in FILES:
+        (tmp_path / name).write_text("old")
+    monkeypatch.setattr(files, "_flush", fails)
+    with pytest.raises(OSError, match=r"sheet\.png"):
+        show("scene.time_limit_steps=3", "episodes=1", "video=false", f"output={tmp_path}")
+    assert [(tmp_path / name).read_text() for name in FILES] == ["old"] * len(FILES)
 
 
 def test_a_refused_view_leaves_no_folder(tmp_path, monkeypatch, capsys):

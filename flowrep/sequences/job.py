@@ -11,6 +11,7 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from flowrep.diagnosis import Diagnosis, Examination
+from flowrep.files import naming
 from flowrep.progress import StopRequest, Stopwatch
 from flowrep.sequences import factorization
 from flowrep.sequences.output import Output
@@ -78,7 +79,7 @@ class Job:
         with StopRequest() as interrupted, tqdm(total=total, unit="frame") as bar:
             for index, result in zip(count(self.start, self.stride), results):
                 if result is not None:
-                    with self.clock("writing"):
+                    with self.clock("writing"), naming(self.output.partial):
                         self.output.append(index, result)
                 bar.update()
                 if interrupted:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrep import viz
-from flowrep.files import append_rows
+from flowrep.files import append_rows, replace_text
 from flowrep.sequences.factorization import FactorizedFrame, factorize_pair
 from flowrep.sequences.files import FlowMap, write_flo, write_kitti_flow, write_picture
 from flowrep.sequences.recording import Frame, Pose, SequenceError
@@ -56,7 +56,7 @@ class Output:
     def __post_init__(self) -> None:
         self.path = Path(self.path)
         self.partial = Path(f"{self.path}.partial")
-        if self.partial.is_dir() and {file.name for file in self.partial.iterdir()} == {"job.json"}:
+        if self.partial.is_dir() and {file.name for file in self.partial.iterdir()} <= {"job.json"}:
             shutil.rmtree(self.partial)  # of a job that was killed before its first frame
         for folder in (self.path, self.partial):
             if os.path.lexists(folder):
@@ -147,7 +147,7 @@ class Output:
         return path
 
     def _write_json(self, name: str, content: Mapping[str, Any]) -> None:
-        (self.partial / name).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        replace_text(self.partial / name, json.dumps(content, indent=2) + "\n")
 
 
 def score(index: int, result: FactorizedFrame, *, moving_px: float) -> dict[str, Any]:

@@ -15,6 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrep.files import replace_file
+
 Image = NDArray[np.uint8]
 
 FLOW_SCALE_PX: dict[str, float] = {"raw": 20.0, "ego": 20.0, "obj": 5.0}
@@ -294,11 +296,12 @@ def contact_sheet(rows: Iterable[Image]) -> Image:
 
 
 def write_png(path: str | Path, image: Image) -> None:
-    """Writes an image `[H, W, 3]`, creating its folder if needed."""
+    """Writes an image `[H, W, 3]` in place of an earlier one, creating its folder if needed."""
     from PIL import Image as pillow
 
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    pillow.fromarray(image).save(path)
+    with replace_file(Path(path)) as file:
+        pillow.fromarray(image).save(file)
 
 
 @lru_cache(maxsize=64)
