@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -24,7 +24,8 @@ class Body(NamedTuple):
 
     corners: Array  # [T, 3, 3], metres, counter-clockwise seen from outside; in the body's
     # coordinates, those of the world if it is static
-    uvs: Array  # [T, 3, 2], the corners' positions in the texture
+    paints: NDArray[np.int64]  # [T], see `paint.Patch`
+    texels: Array  # [T, 3, 2], the corners' positions on a house front
     semantic: int
     instance: int  # 0 for the static world
 
@@ -52,19 +53,19 @@ def gather(bodies: Sequence[Body]) -> Triangles:
     for number, body in enumerate(bodies):
         pose = next(movers) if body.instance else -1
         for chunk in _chunks(body.corners.mean(axis=1), np.arange(len(body.corners))):
-            corners, uvs = body.corners[chunk], body.uvs[chunk]
+            corners, paints, texels = body.corners[chunk], body.paints[chunk], body.texels[chunk]
             # Corners that triangles share are projected once.
             shared, inverse = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
             within = inverse.reshape(-1, 3).astype(np.int32)
-            chunks.append((shared, within, corners, uvs, number, pose))
-    points, indices, corners_m, uvs_of_all, owners, poses = zip(*chunks)
+            chunks.append((shared, within, corners, paints, texels, number, pose))
+    points, indices, corners_m, paints_of_all, texels_of_all, owners, poses = zip(*chunks)
     semantic = np.array([body.semantic for body in bodies], dtype=np.uint8)
     instance = np.array([body.instance for body in bodies], dtype=np.uint8)
     of_triangle = np.repeat(owners, [len(each) for each in indices])
     # Bounding spheres about the middle of each chunk's box: not the least ones, but nearly.
     centres = [(chunk.min(axis=0) + chunk.max(axis=0)) / 2 for chunk in points]
     reaches = [np.linalg.norm(chunk - centre, axis=1) for chunk, centre in zip(points, centres)]
-    look = np.concatenate(corners_m), np.concatenate(uvs_of_all)
+    look = np.concatenate(corners_m), np.concatenate(paints_of_all), np.concatenate(texels_of_all)
     return Triangles(
         points=np.concatenate(points),
         corners=np.concatenate(indices),
@@ -103,30 +104,26 @@ class Mesh:
     """Coloured triangles, counter-clockwise seen from outside."""
 
     def __init__(self) -> None:
-        self._corners: list[Array] = [np.empty((0, 3, 3))]
-        self._uvs: list[Array] = [np.empty((0, 3, 2))]
+        nothing = np.empty((0, 3, 3)), np.empty(0, dtype=np.int64), np.empty((0, 3, 2))
+        self._parts: list[tuple[Array, NDArray[np.int64], Array]] = [nothing]
 
     @property
-    def corners(self) -> Array:
-        """The triangles' corners [T, 3, 3], metres."""
-        return np.concatenate(self._corners)
+    def triangles(self) -> tuple[Array, NDArray[np.int64], Array]:
+        """Corners [T, 3, 3] in metres, paints [T] and texels [T, 3, 2], see `Body`."""
+        corners, paints, texels = map(np.concatenate, zip(*self._parts))
+        return corners, paints, texels
 
-    @property
-    def uvs(self) -> Array:
-        """The corners' positions in the texture [T, 3, 2]."""
-        return np.concatenate(self._uvs)
-
-    def polygon(self, corners: Array, uvs: list[list[float]]) -> None:
+    def polygon(self, corners: Array, patch: Patch, texels: Any = None) -> None:
         """Adds a flat convex polygon [M, 3], counter-clockwise seen from outside."""
         # A fan of triangles from the first corner, which is only right for convex polygons.
         fan = [(0, i, i + 1) for i in range(1, len(corners) - 1)]
-        self._corners.append(corners[fan])
-        self._uvs.append(np.array(uvs)[fan])
+        texels = np.zeros((len(corners), 2)) if texels is None else np.array(texels)
+        self._parts.append((corners[fan], np.full(len(fan), patch.paint), texels[fan]))
 
     def quad(self, corners: Array, patch: Patch) -> None:
         """Adds a rectangle: bottom left, bottom right, top right, top left, seen from outside."""
-        u0, v0, u1, v1 = patch
-        self.polygon(corners, [[u0, v1], [u1, v1], [u1, v0], [u0, v0]])
+        _, u0, v0, u1, v1 = patch
+        self.polygon(corners, patch, [[u0, v1], [u1, v1], [u1, v0], [u0, v0]])
 
     def box(self, low: Point3, high: Point3, side: Patch, *, lid: bool = True) -> None:
         """Adds a box without its floor, and without its top unless `lid`."""
@@ -151,22 +148,21 @@ class Mesh:
         """Adds the sides and top between two level rings [M, 3], counter-clockwise from above."""
         for corners in zip(low, np.roll(low, -1, axis=0), np.roll(high, -1, axis=0), high):
             self.quad(np.array(corners), side)
-        self.polygon(high, [list(lid[:2])] * len(high))
+        self.polygon(high, lid)
         if floor is not None:
-            self.polygon(low[::-1], [list(floor[:2])] * len(low))
+            self.polygon(low[::-1], floor)
 
     def disc(self, centre: Point3, normal: Point3, radius_m: float, patch: Patch) -> None:
         """Adds an upright octagonal disc, visible from the side its normal points to."""
         across = np.array([-normal[1], normal[0], 0.0])
         angles = np.arange(8) * (math.pi / 4)
         rim = np.cos(angles)[:, None] * across + np.sin(angles)[:, None] * np.array([0.0, 0.0, 1.0])
-        self.polygon(np.array(centre) + radius_m * rim, [list(patch[:2])] * len(rim))
+        self.polygon(np.array(centre) + radius_m * rim, patch)
 
     def ground(self, area: shapely.Geometry, height_m: float, paint: str) -> None:
         """Adds an area of the ground plan as a level surface, cut into cells."""
         if area.is_empty:
             return
-        uv = [list(swatch(paint)[:2])] * 3
         x0, y0, x1, y1 = area.bounds
         # A constrained triangulation, so that holes and inward corners of the area stay open.
         for x in np.arange(x0, x1, _CELL_M):
@@ -174,18 +170,18 @@ class Mesh:
                 cell = shapely.intersection(area, shapely.box(x, y, x + _CELL_M, y + _CELL_M))
                 for triangle in shapely.constrained_delaunay_triangles(cell).geoms:
                     ring = shapely.geometry.polygon.orient(triangle).exterior.coords[:3]
-                    self.polygon(np.array([(u, v, height_m) for u, v in ring]), uv)
+                    self.polygon(np.array([(u, v, height_m) for u, v in ring]), swatch(paint))
 
     def move(self, x_m: float, y_m: float, yaw_rad: float) -> None:
         """Turns the mesh and moves it on the ground."""
         sine, cosine = math.sin(yaw_rad), math.cos(yaw_rad)
         turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-        self._corners = [self.corners @ turn.T + [x_m, y_m, 0.0]]
+        corners, *look = self.triangles
+        self._parts = [(corners @ turn.T + [x_m, y_m, 0.0], *look)]
 
     def add(self, other: "Mesh") -> None:
         """Adds another mesh's triangles."""
-        self._corners += other._corners
-        self._uvs += other._uvs
+        self._parts += other._parts
 
 
 def lane_marks(line: shapely.LineString, clear_of: shapely.Geometry) -> Mesh:

@@ -1,10 +1,11 @@
-"""Paint: plain colours and house fronts in one small texture, and the grain on every surface.
+"""Paint: plain colours and house fronts, and the grain on every surface.
 
-The rasteriser multiplies the texture by the grain, so that flow can be estimated on roads and
-clothes, too; on plain asphalt, estimated flow is 0.
+The rasteriser multiplies colours by the grain, so that flow can be estimated on roads and clothes,
+too; on plain asphalt, estimated flow is 0.
 """
 
 from functools import cache
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -12,9 +13,7 @@ from numpy.typing import NDArray
 
 from flowrep.scenes.scene import CATEGORY_ID
 
-SIZE_PX = 256  # a side of the texture
-_SWATCH_PX = 8
-_FRONT_PX = (60, 64)  # height, width of one house front in the texture
+_FRONT_PX = (60, 64)  # height, width of a house front's picture
 _FLOORS = (2, 3, 4, 5)
 # Shares of ambient light and of sunlight, and the direction to the sun in the world.
 AMBIENT, DIFFUSE = 0.62, 0.46
@@ -68,48 +67,43 @@ SHIRTS = tuple(name for name in PAINTS if name.startswith("shirt"))
 _WALLS = ((178, 108, 80), (206, 186, 150), (150, 152, 158), (190, 146, 108))
 NUM_FRONTS = len(_WALLS) * len(_FLOORS)
 
-# (u0, v0, u1, v1): a rectangle of the texture, v downwards.
-Patch = tuple[float, float, float, float]
+
+class Patch(NamedTuple):
+    """What a rectangle shows: a plain colour, or a part of a house front, v downwards."""
+
+    paint: int  # a colour's place in `PAINTS`; from `len(PAINTS)` on, a front's number
+    u0: float = 0.0  # texels of the front, of `FRONT_SIZE`
+    v0: float = 0.0
+    u1: float = 0.0
+    v1: float = 0.0
 
 
 def swatch(name: str) -> Patch:
-    """Returns the middle of a plain colour, as a patch of zero size."""
-    u, v = (list(PAINTS).index(name) + 0.5) * _SWATCH_PX / SIZE_PX, 0.5 * _SWATCH_PX / SIZE_PX
-    return (u, v, u, v)
+    """Returns a plain colour."""
+    return Patch(list(PAINTS).index(name))
 
 
 def front(variant: int) -> Patch:
     """Returns a variant's house front; there are `NUM_FRONTS`, which repeat."""
-    row, column = divmod(variant % NUM_FRONTS, len(_WALLS))
-    (height, width), (top, left) = _FRONT_PX, _corner(row, column)
-    # Half a texel inside its border; otherwise neighbouring fronts would bleed in.
-    pixels = np.array([left + 0.5, top + 0.5, left + width - 0.5, top + height - 0.5])
-    u0, v0, u1, v1 = (pixels / SIZE_PX).tolist()
-    return (u0, v0, u1, v1)
-
-
-def _corner(row: int, column: int) -> tuple[int, int]:
-    return _SWATCH_PX + row * _FRONT_PX[0], column * _FRONT_PX[1]
+    (height, width), inset = _FRONT_PX, 0.5  # pixels from its border, which half a texel lies on
+    texels = [FRONT_SIZE * inset / side for side in (width, height)]
+    texels += [FRONT_SIZE * (side - inset) / side for side in (width, height)]
+    return Patch(len(PAINTS) + variant % NUM_FRONTS, *texels)
 
 
 def upper_storeys(variant: int) -> Patch:
     """Returns a house front above its ground floor, for walls without a door."""
-    u0, v0, u1, v1 = front(variant)
+    whole = front(variant)
     floors = _FLOORS[variant % NUM_FRONTS // len(_WALLS)]
-    return (u0, v0, u1, v1 - (v1 - v0) / floors)
+    return whole._replace(v1=whole.v1 - (whole.v1 - whole.v0) / floors)
 
 
-def texture() -> NDArray[np.uint8]:
-    """Returns the texture [SIZE_PX, SIZE_PX, 3]."""
-    image = np.zeros((SIZE_PX, SIZE_PX, 3), dtype=np.uint8)
-    for i, rgb in enumerate(PAINTS.values()):
-        image[:_SWATCH_PX, i * _SWATCH_PX : (i + 1) * _SWATCH_PX] = rgb
-    height, width = _FRONT_PX
-    for row, floors in enumerate(_FLOORS):
-        for column, rgb in enumerate(_WALLS):
-            top, left = _corner(row, column)
-            _paint_front(image[top : top + height, left : left + width], floors, rgb)
-    return image
+def _front_pictures() -> NDArray[np.uint8]:
+    """Returns the house fronts [NUM_FRONTS, H, W, 3]."""
+    images = np.zeros((NUM_FRONTS, *_FRONT_PX, 3), dtype=np.uint8)
+    for image, (floors, rgb) in zip(images, product(_FLOORS, _WALLS)):
+        _paint_front(image, floors, rgb)
+    return images
 
 
 def _paint_front(image: NDArray[np.uint8], floors: int, rgb: tuple[int, int, int]) -> None:
@@ -137,7 +131,8 @@ class Painted(NamedTuple):
 
 def painted(
     corners: NDArray[np.float64],  # [T, 3, 3], metres, counter-clockwise seen from outside
-    uvs: NDArray[np.float64],  # [T, 3, 2], the corners' positions in the texture
+    paints: NDArray[np.int64],  # [T], see `Patch`
+    texels: NDArray[np.float64],  # [T, 3, 2], the corners' positions on a house front
     semantic: NDArray[np.uint8],  # [T]
     instance: NDArray[np.uint8],  # [T], 0 for the static world
 ) -> Painted:
@@ -162,26 +157,22 @@ def painted(
     grain_axes[:, 0, :3], grain_axes[:, 1, :3] = per_m[:, None] * along, per_m[:, None] * across
     grain_axes[:, 0, 3] = 37.7 * per_m * plane_m + 97.0 * instance
     grain_axes[:, 1, 3] = 17.3 * per_m * plane_m + 61.0 * instance
-    # A plain colour is one point of the texture; only a house front covers an area of it.
-    column, row = np.clip(uvs.mean(axis=1) * SIZE_PX, 0, SIZE_PX - 1).astype(int).T
-    is_front = np.ptp(uvs, axis=1).max(axis=1, initial=0.0) > 0.0
-    column_of_front, row_of_front = column // _FRONT_PX[1], (row - _SWATCH_PX) // _FRONT_PX[0]
-    fronts = np.where(is_front, row_of_front * len(_WALLS) + column_of_front, -1)
+    is_front = paints >= len(PAINTS)
+    colours = np.array([*PAINTS.values()], dtype=np.float32)
     # The affine map from a triangle's points to texels. Its linear part [2, 3] maps the edges a and
     # b to their differences in texels, and the normal n to 0: steps · [a b n]⁻¹.
     front_axes = np.zeros((len(a), 2, 4))
     for i in np.flatnonzero(is_front):
-        top, left = _corner(row_of_front[i], column_of_front[i])
-        texels = (uvs[i] * SIZE_PX - [left, top]) * FRONT_SIZE / np.array(_FRONT_PX[::-1])
-        steps = np.column_stack([texels[1] - texels[0], texels[2] - texels[0], np.zeros(2)])
+        first, second, third = texels[i]
+        steps = np.column_stack([second - first, third - first, np.zeros(2)])
         front_axes[i, :, :3] = steps @ np.linalg.inv(np.column_stack([a[i], b[i], normals[i]]))
-        front_axes[i, :, 3] = texels[0] - front_axes[i, :, :3] @ corners[i, 0]
+        front_axes[i, :, 3] = first - front_axes[i, :, :3] @ corners[i, 0]
     return Painted(
         normals.astype(np.float32),
-        texture()[row, column].astype(np.float32),
+        colours[np.where(is_front, 0, paints)],
         np.array(_CONTRAST, dtype=np.float32)[semantic],
         grain_axes.astype(np.float32),
-        fronts.astype(np.int32),
+        np.where(is_front, paints - len(PAINTS), -1).astype(np.int32),
         front_axes.astype(np.float32),
     )
 
@@ -220,13 +211,12 @@ def grain() -> NDArray[np.float32]:
 @cache
 def front_levels() -> NDArray[np.float32]:
     """Returns the house fronts with grain: `[fronts, 2 * FRONT_SIZE, FRONT_SIZE, 3]`."""
-    image, fronts = texture().astype(np.float32), []
+    pictures, fronts = _front_pictures().astype(np.float32), []
     pattern = grain()[:GRAIN_SIZE, :, 0]
     rows = ((np.arange(FRONT_SIZE) + 0.5) * _FRONT_PX[0] / FRONT_SIZE).astype(int)
     for number in range(NUM_FRONTS):
         row, column = divmod(number, len(_WALLS))
-        top, left = _corner(row, column)
-        level = image[top + rows, left : left + _FRONT_PX[1]]
+        level = pictures[number, rows]
         # Every fourth texel of the grain, so that its waves are as long as on the ground.
         waves = pattern[row * 16 :: 4, column * 16 :: 4][:FRONT_SIZE, :FRONT_SIZE, None]
         levels = [level * (1.0 + _CONTRAST[CATEGORY_ID["building"]] * waves)]

@@ -143,7 +143,7 @@ class Street:
         grass.ground(layout.terrain, 0.0, "grass")
         grounds = {"road": road, "crosswalk": crosswalks, "sidewalk": paving, "terrain": grass}
         for category, mesh in grounds.items():
-            if len(mesh.corners):
+            if len(mesh.triangles[0]):
                 self._add_body(mesh, category)
 
     def _add_solids(self, boxes: list[Box]) -> None:
@@ -163,7 +163,7 @@ class Street:
         return solid
 
     def _add_body(self, mesh: Mesh, category: str, instance: int = 0) -> None:
-        self.bodies.append(Body(mesh.corners, mesh.uvs, CATEGORY_ID[category], instance))
+        self.bodies.append(Body(*mesh.triangles, CATEGORY_ID[category], instance))
 
 
 _STREETS: WeakValueDictionary[bytes, Street] = WeakValueDictionary()

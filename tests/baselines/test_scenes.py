@@ -168,13 +168,13 @@ def test_the_planner_succeeds_where_never_turning_and_random_actions_fail(drive,
 @pytest.mark.parametrize("name", scene_names())
 def test_the_kerb_is_on_the_sidewalk_and_paving_is_below_it(name):
     layout = Layout(load_scene(name))
-    stones = kerb(layout.drivable, layout.sidewalks)
-    stone = shapely.union_all(shapely.polygons(stones.corners[:, :, :2]))
+    stones = kerb(layout.drivable, layout.sidewalks).triangles[0]
+    stone = shapely.union_all(shapely.polygons(stones[:, :, :2]))
     assert stone.difference(layout.sidewalks.buffer(1e-6)).area == 0
     # A quarter of a metre all along the road, where there is a sidewalk.
     along = layout.drivable.boundary.intersection(layout.sidewalks.buffer(1e-6)).length
     assert stone.area == pytest.approx(0.25 * along, rel=0.02)
-    assert (stones.corners[..., 2] > 0).all()  # or it would flicker with the paving
+    assert (stones[..., 2] > 0).all()  # or it would flicker with the paving
 
 
 def test_lane_marks_stop_where_crosswalks_and_other_roads_are():
@@ -184,7 +184,7 @@ def test_lane_marks_stop_where_crosswalks_and_other_roads_are():
     marks = lane_marks(
         layout.lines["bar"], shapely.union_all([west, layout.ribbons["east"], striped])
     )
-    points = shapely.points(marks.corners.reshape(-1, 3)[:, :2])
+    points = shapely.points(marks.triangles[0].reshape(-1, 3)[:, :2])
     # 70 m of bar less half a leg at either end and the crosswalk: ten dashes, six metres apart.
     assert len(points) > 30
     assert not shapely.intersects(points, striped).any()

@@ -118,7 +118,7 @@ def test_nobody_sinks_into_the_ground_or_outgrows_the_cylinder(swing):
     poses = np.array([[0.0, 0.0, 0.0, swing]])
     points = np.concatenate(
         [
-            mesh.corners.reshape(-1, 3) @ transform[:3, :3].T + transform[:3, 3]
+            mesh.triangles[0].reshape(-1, 3) @ transform[:3, :3].T + transform[:3, 3]
             for mesh, transform in zip(person_meshes(0), world_from_parts(poses), strict=True)
         ]
     )

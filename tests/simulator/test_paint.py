@@ -19,7 +19,7 @@ def rectangle(paint, semantic, x, y, z=0.0, *, instance=0):
     mesh = Mesh()
     corners = [(x[0], y[0], z), (x[1], y[0], z), (x[1], y[1], z), (x[0], y[1], z)]
     mesh.quad(np.array(corners), swatch(paint))
-    return Body(mesh.corners, mesh.uvs, semantic, instance)
+    return Body(*mesh.triangles, semantic, instance)
 
 
 def seen_from_above(*bodies, x=0.0, y=0.0, height_m=2.0, size=(40, 60), focal_px=40.0, poses=()):

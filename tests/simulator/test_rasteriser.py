@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from flowrep.simulator.meshes import Body, gather
+from flowrep.simulator.meshes import Body, Mesh, gather
+from flowrep.simulator.paint import swatch
 from flowrep.simulator.rasteriser import Rasteriser
 
 # Nothing is square and nothing centred, so that no two numbers can be swapped.
@@ -18,8 +19,9 @@ WALL, BALL = (3, 0), (4, 7)  # class, instance
 
 def quad(corners, ids=WALL):
     """A body of one quadrangle, counter-clockwise seen from its outside."""
-    triangles = np.array(corners, dtype=float)[[(0, 1, 2), (0, 2, 3)]]
-    return Body(triangles, np.zeros((2, 3, 2)), *ids)
+    mesh = Mesh()
+    mesh.polygon(np.array(corners, dtype=float), swatch("asphalt"))
+    return Body(*mesh.triangles, *ids)
 
 
 def facing(z, x0, x1, y0, y1, ids=WALL):
@@ -124,5 +126,7 @@ def test_neighbouring_triangles_leave_no_gap():
     angles = np.linspace(0, 2 * math.pi, 61)[:-1]
     rim = np.stack([50 * np.cos(angles), 50 * np.sin(angles), np.full(60, 3.0)], axis=1)
     middle = np.tile((0.123, -0.077, 3.0), (60, 1))
-    corners = np.stack([middle, np.roll(rim, -1, axis=0), rim], axis=1)
-    assert np.isfinite(see(Body(corners, np.zeros((60, 3, 2)), *WALL))[0]).all()
+    fan = Mesh()
+    for corners in np.stack([middle, np.roll(rim, -1, axis=0), rim], axis=1):
+        fan.polygon(corners, swatch("asphalt"))
+    assert np.isfinite(see(Body(*fan.triangles, *WALL))[0]).all()
