@@ -94,6 +94,9 @@ class DeclaredRecording(Recording):
             raise ValueError(
                 f"flow_range is size, or the least and the most, not {self.flow_range}"
             )
+        for word in ("scene", "camera", "render"):
+            if getattr(self, word) is not None and f"{{{word}}}" not in str(vars(self)):
+                raise SequenceError(f"format.{word}", "stands in no file's name of this format")
         options = "flow", "flow_mask", "times", "poses"
         self._flow, self._flow_mask, self._times, self._pose_files = map(self._sources, options)
         self._check_flow()
@@ -199,7 +202,7 @@ class DeclaredRecording(Recording):
             raise SequenceError(path, f"{says}: {remedy}, or its format=") from None
         if not found:
             used = (self.rgb, self.depth, self.flow, self.intrinsics)
-            layout = ", ".join(name for name in used if isinstance(name, str))
+            layout = ", ".join(name.rstrip("?") for name in used if isinstance(name, str))
             raise SequenceError(path, f"no such files: give a folder with {layout}, or its format=")
         if not times:
             return found, None

@@ -365,6 +365,7 @@ def test_brackets_in_a_name_are_brackets(moments, tmp_path):
         ({"depth_unit_m": "0.001"}, "depth_unit_m"),
         ({"depth_unit_m": -0.001}, "depth_unit_m"),
         ({"flow_unit_px": 0.0}, "flow_unit_px"),
+        ({"camera": "right"}, r"format\.camera"),
         ({"flow_range": [1.0]}, "flow_range"),
         ({"intrinsics_kind": "cam_from_uv", "intrinsics": [0.5]}, "intrinsics: .*cam_from_uv"),
         ({"poses": ["depth/*", "poses.txt"]}, r"depth/\*: is a file per frame"),
