@@ -86,27 +86,20 @@ def test_a_reset_mask_of_false_resets_no_street_and_no_mask_resets_all(make):
 
 
 @pytest.mark.parametrize(
-    ("num_envs", "num_workers", "named"),
+    ("arguments", "message"),
     [
-        (0, 0, "num_envs"), (1.5, 0, "num_envs"), (2, 3, "num_workers"), (2, -1, "num_workers"),
-        (2, "auto", "num_workers"),  # as commands have it
+        ({"num_envs": 0}, "num_envs "),
+        ({"num_envs": 1.5}, "num_envs "),
+        ({"num_envs": 2, "num_workers": 3}, "num_workers "),
+        ({"num_envs": 2, "num_workers": -1}, "num_workers "),
+        ({"num_envs": 2, "num_workers": "auto"}, "num_workers "),  # as commands have it
+        *(({"seed": seed}, f"seed .*{seed}") for seed in ("x", 2.5, -1)),
+        *(({"device": it}, rf"device={it} .*device=cpu$") for it in ("cuda:93", "gpu", 2.5)),
     ],
-)  # fmt: skip
-def test_no_environments_and_too_many_workers_are_refused(num_envs, num_workers, named):
-    with pytest.raises(ValueError, match=f"^{named} "):
-        make_env("straight_road", num_envs=num_envs, num_workers=num_workers)
-
-
-@pytest.mark.parametrize("seed", ["x", 2.5, -1])
-def test_a_seed_that_is_no_whole_number_is_refused(seed):
-    with pytest.raises(ValueError, match=f"^seed .*{seed}"):
-        make_env("straight_road", seed=seed)
-
-
-@pytest.mark.parametrize("device", ["cuda:93", "gpu", 2.5])
-def test_an_unusable_device_is_refused(device):
-    with pytest.raises(ValueError, match=rf"^device={device} .*device=cpu$"):
-        make_env("straight_road", device=device)
+)
+def test_an_argument_that_can_not_be_is_refused_by_its_name(arguments, message):
+    with pytest.raises(ValueError, match=f"^{message}"):
+        make_env("straight_road", **arguments)
 
 
 def test_a_transform_of_dropped_sensors_says_how_to_keep_them(make):

@@ -47,7 +47,7 @@ def test_values_in_the_mirror_image_are_those_of_the_mirrored_actions():
 
 def test_the_teacher_learns_that_driving_at_random_ends_badly():
     scene = load_scene("straight_road")
-    teacher = distillation.train_teacher(scene, 6400, seed=0)
+    teacher = distillation.train_teacher(scene, 5120, seed=0)
     env = StreetEnv(scene, sensors=())
     env.begin(seed=1)
     state = torch.from_numpy(distillation.state_of(env.episode))[None]
