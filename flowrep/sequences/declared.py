@@ -168,12 +168,9 @@ class DeclaredRecording(Recording):
                 self._rgbs = [*listed.values()]
         self._names, found = [*listed], [*depths.values()]
         if self.depth_by == "time" and self._times_s is not None and depth_times_s is not None:
-            (rows, _), _ = match_times(depth_times_s, self._times_s, self.tolerance_s)
-            # Two pictures may have the same nearest depth map; it belongs to the nearer picture.
-            (nearest, _), _ = match_times(self._times_s, depth_times_s, self.tolerance_s)
+            rows = matching.match_depth(depth_times_s, self._times_s, self.tolerance_s)
             self._depths = [found[row] for row in rows]
-            lacking = (rows < 0) | (nearest[rows] != np.arange(len(rows)))
-            return {f"without depth within {self.tolerance_s} s": lacking}
+            return {f"without depth within {self.tolerance_s} s": rows < 0}
         by_order = self.depth_by == "order"
         ours, theirs = (range(len(x)) if by_order else x for x in (self._names, depths))
         if unpaired := {*ours} ^ {*theirs}:

@@ -36,6 +36,16 @@ def match_times(
     return np.where(near, [nearest, nearest], -1), np.zeros(len(nearest))
 
 
+def match_depth(depth_times_s: Floats, times_s: Floats, tolerance_s: float) -> Indices:
+    """Returns the depth map nearest to each picture, -1 if it is too far, or another picture's.
+
+    Two pictures may have the same nearest depth map; it belongs to the nearer picture.
+    """
+    (rows, _), _ = match_times(depth_times_s, times_s, tolerance_s)
+    (pictures, _), _ = match_times(times_s, depth_times_s, tolerance_s)
+    return np.where(pictures[rows] == np.arange(len(rows)), rows, -1)
+
+
 def poses_between(poses: Floats, rows: Indices, share: Floats) -> Floats:
     """Returns the poses at a share of the way, for constant velocity and angular velocity."""
     moved = poses[rows[0]]

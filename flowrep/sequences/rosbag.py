@@ -6,7 +6,7 @@ import math
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from itertools import chain, islice
+from itertools import chain, islice, takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from flowrep.extras import require
 from flowrep.sequences.calibration import Lens, Matrix, Rig, as_pose, camera_matrix, lens_of
 from flowrep.sequences.files import decoded, regular
-from flowrep.sequences.matching import keep, match_times, poses_between, positions
+from flowrep.sequences.matching import keep, match_depth, match_times, poses_between, positions
 from flowrep.sequences.recording import Frame, Pose, Recording, SequenceError
 
 # Encodings by their type and channels; of colour, the order in which red, green and blue stand.
@@ -112,7 +112,7 @@ class RosBag(Recording):
         """Matches depth and transforms to pictures, and says how well they fit."""
         start = min(stamps[0], depth_stamps[0])
         times_s, depth_times_s = ((np.array(x) - start) * 1e-9 for x in (stamps, depth_stamps))
-        (rows, _), _ = match_times(depth_times_s, times_s, self.tolerance_s)
+        rows = match_depth(depth_times_s, times_s, self.tolerance_s)
         said = [f"pictures are {self._rgb}, depth {self._depth}"]
         if (rows >= 0).any():
             lag_s = np.median((depth_times_s[rows] - times_s)[rows >= 0])
@@ -246,8 +246,8 @@ class RosBag(Recording):
         ends, bases = [], set()
         for frame in (colour, depth):
             pose = np.eye(4)
-            while frame in self._edges and self._edges[frame].is_static:
-                pose, frame = self._edges[frame].poses[-1] @ pose, self._edges[frame].parent
+            for edge in takewhile(lambda edge: edge.is_static, self._edges_above(frame, None)):
+                pose, frame = edge.poses[-1] @ pose, edge.parent
             ends.append(pose)
             bases.add(frame)
         if len(bases) > 1:

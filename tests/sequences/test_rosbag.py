@@ -104,7 +104,8 @@ def stamp(i):
     return START_NS + i * PERIOD_NS
 
 
-def write(kind, folder, *, static=True, depth="16UC1", late_ns=0, optical="optical", tf=(0, 1, 2)):
+def write(kind, folder, *, static=True, depth="16UC1", late_ns=0, optical="optical", tf=(0, 1, 2),
+          depths=(0, 1, 2)):  # fmt: skip
     moments = make_moments(unit_m=0.001)
     bag = Bag(kind, folder)
     with bag.writer:
@@ -115,7 +116,9 @@ def write(kind, folder, *, static=True, depth="16UC1", late_ns=0, optical="optic
         for i, moment in enumerate(moments):
             bag.image(RGB, stamp(i), "optical", "bgr8", moment.rgb[..., ::-1])
             ns = stamp(i) + late_ns
-            if depth == "16UC1":
+            if i not in depths:
+                pass
+            elif depth == "16UC1":
                 bag.image(DEPTH, ns, optical, depth, stored(moment.depth, 0.001))
             elif depth == "32FC1":
                 bag.image(DEPTH, ns, optical, depth, moment.depth)
@@ -158,6 +161,26 @@ def test_a_bag_of_either_generation_is_read(kind, tmp_path):
 def test_each_kind_of_depth_is_metres(depth, rtol, tmp_path):
     path, moments = write("mcap", tmp_path, depth=depth)
     assert_is_read(open_recording(path, "rosbag"), moments, rtol=rtol)
+
+
+def test_a_picture_without_depth_of_its_own_is_left_out(tmp_path):
+    # Depth of the first picture is 93 ms from the second, but 7 ms from its own.
+    path, _ = write("mcap", tmp_path, late_ns=7_000_000, depths=(0, 2))
+    recording = open_recording(path, "rosbag")
+    assert [frame.position for frame in recording] == [0, 2]
+    assert any(note.startswith("1 of 3") for note in recording.notes)
+
+
+def test_transforms_in_a_circle_end(tmp_path):
+    bag = Bag("ros1", tmp_path)
+    with bag.writer:
+        bag.info("/color/camera_info", "a")
+        for parent, child in (("a", "b"), ("b", "a")):
+            bag.transform("/tf_static", START_NS, parent, child, np.eye(4))
+        bag.image("/color/image", START_NS, "a", "rgb8", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+        bag.image("/depth/image", START_NS, "c", "32FC1", np.ones((HEIGHT, WIDTH), np.float32))
+    with pytest.raises(SequenceError, match="aligned"):
+        open_recording(bag.path, "rosbag")
 
 
 @pytest.mark.parametrize("kind", KINDS[:2])
