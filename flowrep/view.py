@@ -16,8 +16,6 @@ from flowrep.extras import require
 
 require("viewing", "train", "hydra", "pydantic", "matplotlib", "imageio_ffmpeg", module=__name__)
 
-from hydra.core.hydra_config import HydraConfig
-
 from flowrep.config.cli import run_command
 from flowrep.config.folders import folder_name
 from flowrep.config.usage import UsageError
@@ -40,30 +38,22 @@ FILES = ("sheet.png", "episode.mp4", "plan.png", "episodes.csv")
 
 def run(config: ViewConfig) -> None:
     """Writes pictures, a film and tables of the scene."""
-    keys = [text.partition("=")[0].lstrip("+") for text in HydraConfig.get().overrides.task]
-    changed = [key for key in keys if key.startswith("scene.")]
-    if keeps_scene(config, "scene" in keys) and changed:
-        raise UsageError(f"{changed[0]}= changes a scene: add scene=, which names it")
+    policy_of(config.policy)  # refuses a wrong name before PyTorch is imported
 
     from flowrep.experiment.film import Film
 
-    agent = agent_of(config, "scene" in keys)
+    agent = agent_of(config)
     with closing(Film(agent, **street_of(config))) as film:
         view(config, agent, film)
 
 
-def keeps_scene(config: ViewConfig, is_scene_given: bool) -> bool:
-    """Returns whether a trained agent drives in the scene of its training."""
-    return policy_of(config.policy).has_scene and not is_scene_given
-
-
-def agent_of(config: ViewConfig, is_scene_given: bool) -> Agent:
-    """Returns what drives: a trained agent in the scene of its training, unless one was given."""
+def agent_of(config: ViewConfig) -> Agent:
+    """Returns what drives."""
     from flowrep.experiment.agents import Agent
 
     return Agent.load(
         config.policy,
-        scene=None if keeps_scene(config, is_scene_given) else config.scene,
+        scene=config.scene,
         representations=config.representations,
         trusted=config.trusted,
         device="cpu",

@@ -62,7 +62,7 @@ def evaluate(run, *typed):
 
 
 def view(run, *typed):
-    return agent_of(validated(ViewConfig, plain("view", f"policy={run.path}", *typed)), False)
+    return agent_of(validated(ViewConfig, plain("view", f"policy={run.path}", *typed)))
 
 
 def repeated_sweep(run, *typed):

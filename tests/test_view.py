@@ -37,8 +37,8 @@ def options_of(config):
     return episodes_of(config, config.scene)
 
 
-def driven(config, is_scene_given=True):
-    return drive_on(config, agent_of(config, is_scene_given), options_of(config))
+def driven(config):
+    return drive_on(config, agent_of(config), options_of(config))
 
 
 def asked(*overrides):
@@ -47,7 +47,7 @@ def asked(*overrides):
 
 def show(*overrides):
     config = asked(*SMALL, *overrides)
-    agent = agent_of(config, is_scene_given=True)
+    agent = agent_of(config)
     with closing(Film(agent)) as film:
         view(config, agent, film)
 
@@ -77,23 +77,25 @@ def test_a_run_drives_in_its_scene_and_a_policy_from_a_file_in_the_one_asked_for
     path = tmp_path / "mine.py"
     path.write_text("def make(task):\n    return lambda maps: [0] * len(maps)\n")
     ended = {}
-    for policy, scene in ((str(run.path), "straight_road"), (f"{path}:make", "s_turn")):
-        maps = ["representations=[seg]"] if policy.endswith(":make") else []
-        config = asked(f"policy={policy}", "scene=s_turn", "episodes=3", *maps)
-        agent = agent_of(config, is_scene_given=False)
+    from_file = ["scene=s_turn", "representations=[seg]"]
+    cases = (str(run.path), "straight_road", []), (f"{path}:make", "s_turn", from_file)
+    for policy, scene, given in cases:
+        config = asked(f"policy={policy}", "episodes=3", *given)
+        agent = agent_of(config)
         film = Film(agent)
         assert film.street.scene.name == scene  # a run's agent is at home in its own
         film.close()
-        ended[policy] = drive_on(config, agent, options_of(config))
+        ended[policy] = drive_on(config, agent, episodes_of(config, agent.config.scene))
         assert [episode.episode_seed for episode in ended[policy]] == [0, 1, 2]
     never = driven(asked("policy=never_turn", "scene=s_turn", "episodes=3"))
     assert [e.outcome for e in ended[f"{path}:make"]] == [e.outcome for e in never]
 
 
 def test_a_view_has_the_speed_and_the_frame_rate_asked_for():
-    (episode,) = driven(asked("fps=6", "speed=high", "scene.time_limit_steps=12", "episodes=1"))
+    short = "scene=s_turn", "scene.time_limit_steps=12", "episodes=1"
+    (episode,) = driven(asked(*short, "fps=6", "speed=high"))
     assert (episode.fps, episode.speed) == (6.0, "high")
-    (episode,) = driven(asked("scene.frame_rate_hz=8", "scene.time_limit_steps=12", "episodes=1"))
+    (episode,) = driven(asked(*short, "scene.frame_rate_hz=8"))
     assert (episode.fps, episode.speed) == (8.0, "normal")
 
 
@@ -109,7 +111,8 @@ def test_each_scene_and_policy_has_a_folder():
 def test_a_view_replaces_the_files_of_an_earlier_one_and_no_others(tmp_path):
     for name in (*FILES, "notes.txt"):
         (tmp_path / name).write_text("old")
-    show("scene.time_limit_steps=3", "episodes=1", "video=false", f"output={tmp_path}")
+    short = "scene=s_turn", "scene.time_limit_steps=3", "episodes=1"
+    show(*short, "video=false", f"output={tmp_path}")
     left = {path.name for path in tmp_path.iterdir()}
     assert left == {*FILES, "notes.txt"} - {"episode.mp4"}
     assert [path.name for path in tmp_path.iterdir() if path.read_bytes() == b"old"] == [
@@ -139,7 +142,7 @@ def test_a_refused_view_leaves_no_folder(tmp_path, monkeypatch, capsys):
 
 def test_a_policy_from_a_file_needs_its_representations():
     with pytest.raises(UsageError, match="representations"):
-        driven(asked("policy=mine:make"))
+        driven(asked("policy=mine:make", "scene=s_turn"))
 
 
 def test_every_episode_takes_the_path_asked_for():
@@ -163,15 +166,3 @@ def test_only_moving_pixels_beyond_four_metres_count_for_the_sheet():
     obj[1, 0, 1:] = 0.5  # v alone
     depth = torch.tensor([[[9.0, 3.0, 9.0, torch.inf]]])
     assert moving_pixels({"obj": obj, "depth": depth}) == 2
-
-
-def test_a_scene_of_a_trained_agent_is_not_changed_unless_it_is_named(
-    tmp_path, monkeypatch, capsys
-):
-    (tmp_path / "config.yaml").touch()  # a run's folder
-    typed = [f"policy={tmp_path}", "scene.time_limit_steps=4"]
-    monkeypatch.setattr(sys, "argv", ["flowrep-view", *typed])
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert end.value.code == 2
-    assert "scene.time_limit_steps= changes a scene: add scene=" in capsys.readouterr().err

@@ -93,11 +93,11 @@ class Agent(Driver):
                 project: path.py:make or package.module:make.
             trusted: classes outside of flowrep that a run may name; their code runs.
             precision: the number format of a trained agent's networks, instead of the run's.
-            env: `scene`, a name or a definition (a trained agent keeps the camera of its training,
-                and without `scene`, the scene); `device`, by default "auto"; `num_envs` side by
-                side; `num_workers`, processes that step them, or "auto". For a policy from another
-                project also `representations`, the names of its maps or a mapping from name to
-                options, and `flow`, `motion` and `noise` as in conf/.
+            env: `scene`, a name or a definition, by default that of the training or of conf/ (a
+                trained agent keeps the camera of its training); `device`, by default "auto";
+                `num_envs` side by side; `num_workers`, processes that step them, or "auto". For a
+                policy from another project also `representations`, the names of its maps or a
+                mapping from name to options, and `flow`, `motion` and `noise` as in conf/.
 
         Raises:
             UsageError: there is no such agent.

@@ -59,8 +59,6 @@ class NamedPolicy:
 
     takes: ClassVar[tuple[str, ...]] = ("scene", "device", "num_envs", "num_workers")
     """The keywords of `Agent.load` that describe its env."""
-    has_scene = False
-    """Whether it drives in the scene of its training unless another one is given."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -92,7 +90,6 @@ class NamedBaseline(NamedPolicy):
 class TrainedPolicy(NamedPolicy):
     """An agent that flowrep trained: its camera remains that of the training."""
 
-    has_scene = True
     precision: str | None = None
     """The number format of its networks where none is given; None for that of the training."""
 
@@ -162,15 +159,20 @@ class SavedPolicy(TrainedPolicy):
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
-        self.has_scene = name != "pretrained"
-        if self.has_scene:
+        if name != "pretrained":
             _check_is_there(name, name)
+
+    def load(self, env: Mapping[str, Any], trusted: Collection[str], precision: Any) -> Loaded:
+        """Returns the network with its weights; flowrep's drives in a scene of conf/."""
+        if self.name == "pretrained" and env.get("scene") is None:
+            env = {**env, "scene": composed(TrainConfig, {})[0].scene}
+        return super().load(env, trusted, precision)
 
     def stored(self, scene: Scene | None, trusted: Collection[str]) -> Stored:
         """Reads the file."""
         from flowrep.agent import load_checkpoint
 
-        path = Path(self.name) if self.has_scene else _pretrained(scene)
+        path = _pretrained(scene) if self.name == "pretrained" else Path(self.name)
         state = load_checkpoint(path, ["config", "frames", "policy"])
         return validated_run(state["config"], path.name, trusted), state, path
 
@@ -181,8 +183,7 @@ def _check_is_there(name: str, file: str) -> None:
 
 
 def _pretrained(scene: Scene | None) -> Path:
-    if scene is None:
-        raise UsageError("scene needs a value for policy=pretrained")
+    assert scene is not None
     files = {file.stem: file for file in PRETRAINED.glob("*.safetensors")}
     if scene.name not in files:
         there = closest_first(scene.name, files)

@@ -194,11 +194,10 @@ class Runner:
         """Films an episode if none is filmed."""
         # Drawing takes seconds to import.
         from flowrep.experiment.film import record_episode
-        from flowrep.viz import is_playable
 
         self.close()  # its worker processes take memory, and so does filming
         path = self.folder.video_path(f"episode_{self.config.speed}")
-        if self.config.evaluation.video and not is_playable(path):
+        if self.config.evaluation.video and not path.is_file():
             driver = Driver(self.agent.policy, self.config, self.frames)
             record_episode(driver, path, episode_seed=FIRST_SEEDS["final"])
             print(f"video: {path}")

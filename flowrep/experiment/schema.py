@@ -233,7 +233,7 @@ class EvaluateConfig(Command):
 class ViewConfig(Command):
     """The whole config of `flowrep.view`."""
 
-    scene: SceneSection
+    scene: SceneSection | None = None
     representations: MapOptions | None = None
     policy: Text
     algorithm: Trusted

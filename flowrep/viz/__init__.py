@@ -20,11 +20,11 @@ from flowrep.viz.maps import (
     strip,
     write_png,
 )
-from flowrep.viz.video import Video, is_playable, write_video
+from flowrep.viz.video import Video, write_video
 
 __all__ = [
     "CLASS_COLOURS", "DEPTH_RANGE_M", "FLOW_SCALE_PX", "OUTCOME_COLOURS", "Image", "Tile", "Video",
     "classes_to_rgb", "contact_sheet",
     "depth_note", "depth_to_rgb", "flow_note", "flow_to_rgb", "flow_wheel", "grey_to_rgb",
-    "is_playable", "representation_strip", "stock_tiles", "strip", "write_png", "write_video",
+    "representation_strip", "stock_tiles", "strip", "write_png", "write_video",
 ]  # fmt: skip

@@ -102,13 +102,3 @@ def write_video(path: str | Path, frames: Iterable[Image], *, fps: float) -> Non
     with replace_file(Path(path)) as partial, closing(Video(partial, fps=fps)) as video:
         for frame in frames:
             video.append(frame)
-
-
-def is_playable(path: str | Path) -> bool:
-    """Returns whether a file exists and FFmpeg can read its frames."""
-    from imageio_ffmpeg import count_frames_and_secs
-
-    try:
-        return Path(path).is_file() and count_frames_and_secs(str(path))[0] > 0
-    except RuntimeError:  # FFmpeg can't read it
-        return False

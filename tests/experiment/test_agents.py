@@ -181,7 +181,6 @@ def test_an_evaluation_that_can_not_be_is_refused(given, named):
         ("pretrained", {"scene": "s_turn", "motion": "exact"}, "motion="),
         ("pretrained", {"scene": "s_turn", "representations": ["ego"]}, "representations="),
         ("planner", {"representations": {"rgb": None}}, "representations="),
-        ("pretrained", {}, "scene"),
         ("pretrained", {"scene": "s_turn", "num_envs": 0}, "num_envs"),
         ("pretrained", {"scene": "s_turn", "num_workers": "many"}, "num_workers"),
         ("pretrained", {"scene": "s_turn", "device": "gpu"}, "device"),

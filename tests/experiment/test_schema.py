@@ -143,7 +143,7 @@ def test_what_is_wrong_in_a_run_folder_is_named_with_the_file():
         ("evaluate", EvaluateConfig, [
             "policy=a.py:make", "scene=s_turn", "flow=exact", "noise=none", "representations=[ego]",
         ]),
-        ("view", ViewConfig, ["representations=[ego]"]),
+        ("view", ViewConfig, ["scene=s_turn", "representations=[ego]"]),
         ("factorize", FactorizeConfig, ["format=tum", "input=x", "output=y"]),
         ("report", ReportConfig, ["run=x"]),
     ],
