@@ -254,7 +254,9 @@ def as_typed(arguments: Sequence[str], schema: type[Command]) -> list[str]:
         key, _, value = text.partition("=")
         # Neither a flag nor the value of one, as of `--config-dir mine`.
         is_argument = text[:1] not in "-~+" and not previous.startswith("-")
-        if is_argument and "run" in schema.model_fields and (text == key or Path(text).exists()):
+        # Not Path's: it raises for what is longer than a file's name.
+        names_run = text == key or os.path.exists(text)
+        if is_argument and "run" in schema.model_fields and names_run:
             folders.append(override("run", text).removeprefix("run="))
         else:
             others.append(override(key, value) if _is_folder(key, value) else text)
@@ -269,7 +271,7 @@ def _is_folder(key: str, value: str) -> bool:
     """Returns whether a value is the name of a folder, not yet in quotes."""
     is_camera = key == "input" and value.isdigit()
     is_for_hydra = value[:1] in ("", "[", "'", '"') or value in ("null", "???") or "${" in value
-    return key in FOLDERS and (Path(value).exists() or not (is_camera or is_for_hydra))
+    return key in FOLDERS and (os.path.exists(value) or not (is_camera or is_for_hydra))
 
 
 def value_of(text: str) -> str:

@@ -295,6 +295,11 @@ def test_folders_without_a_key_are_runs(tmp_path, monkeypatch):
     assert read(shlex.join(["report", *typed])) == {"run": ["it's", "b c"], "policy": "sampled"}
 
 
+def test_a_value_may_be_longer_than_a_files_name():
+    typed = [f"scene.paths=[{'a,' * 3000}b]"]
+    assert cli.as_typed(typed, SCHEMAS["evaluate"]) == typed
+
+
 # Names of folders.
 
 
