@@ -349,6 +349,6 @@ def test_a_policy_without_actions_leaves_a_line_and_no_row(tmp_path, capsys):
     assert capsys.readouterr().out == ""  # no table of no episodes, in a file that isn't there
 
 
-def test_a_runs_folder_is_no_place_for_the_rows_of_another_policy(run):
+def test_rows_of_another_policy_are_refused_in_a_runs_folder(run):
     with pytest.raises(UsageError, match="output"):
         own("examples/own_policy.py:make", run.path, "representations=[seg]")

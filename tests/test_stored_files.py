@@ -101,7 +101,7 @@ def test_another_name_on_the_command_line_is_not_the_stored_one(stranger, use, k
 
 
 @pytest.mark.parametrize("key", KEYS)
-def test_what_the_user_typed_is_imported(stranger, key):
+def test_a_class_that_the_user_typed_is_imported(stranger, key):
     for use in (evaluate, view):
         # past the config: there is no checkpoint
         with pytest.raises(CheckpointError, match=r"latest\.safetensors"):

@@ -88,7 +88,7 @@ def test_a_mistake_ends_in_lines_that_name_it_and_what_exists(run, line, names):
         "view scene=s_turn",
     ],
 )
-def test_what_hydra_accepts_passes(run, line):
+def test_the_syntax_of_hydras_command_line_is_accepted(run, line):
     if "slurm" in line:
         pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     command, *arguments = line.split()
@@ -260,7 +260,7 @@ def test_a_pasted_line_gives_the_very_text():
         assert read(line) == {"resume": text}
 
 
-def test_what_needs_no_quotes_has_none(monkeypatch):
+def test_a_printed_command_has_quotes_only_where_they_are_needed(monkeypatch):
     folder = "outputs/2026-01-31/12_ego+obj_s1"
     monkeypatch.setattr(sys, "argv", ["/usr/bin/flowrep-train"])
     assert cli.line_for("evaluate", run=folder) == f"flowrep-evaluate run={folder}"
@@ -281,7 +281,9 @@ FOLDERS = [
 
 
 @pytest.mark.parametrize(("typed", "value"), FOLDERS)
-def test_a_folder_is_taken_as_it_was_typed_and_nothing_else_is(tmp_path, monkeypatch, typed, value):
+def test_a_folders_name_is_taken_literally_and_other_values_are_not(
+    tmp_path, monkeypatch, typed, value
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a,b=[c]").mkdir()
     (line,) = cli.as_typed([typed], SCHEMAS["train"])

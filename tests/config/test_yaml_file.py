@@ -27,7 +27,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_what_cannot_be_read_is_one_line_with_file_and_line(tmp_path, monkeypatch, wrong):
+def test_yaml_that_cannot_be_read_is_one_line_with_file_and_line(tmp_path, monkeypatch, wrong):
     content, said = WRONG[wrong]
     monkeypatch.chdir(tmp_path)
     file = tmp_path / "odd.yaml"

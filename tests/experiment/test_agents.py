@@ -166,7 +166,7 @@ def test_a_run_that_can_not_be_built_does_not_take_its_folder(tmp_path):
         ({"baselines": ["plan"]}, "baselines"),
     ],
 )
-def test_an_evaluation_that_can_not_be_is_refused(given, named):
+def test_an_impossible_evaluation_is_refused_by_its_key(given, named):
     agent = Agent.load("never_turn", scene="s_turn")
     with pytest.raises(UsageError, match=rf"^{named}\b"):
         agent.evaluate(**{"episodes": 1, **given})
@@ -191,7 +191,7 @@ def test_an_evaluation_that_can_not_be_is_refused(given, named):
         ("12:00.safetensors", {}, "12:00.safetensors"),  # a colon, as in module:make
     ],
 )
-def test_what_can_not_be_loaded_is_refused(name, given, named):
+def test_a_wrong_policy_or_keyword_is_refused_by_its_name(name, given, named):
     with pytest.raises((UsageError, CheckpointError), match=named):
         Agent.load(name, **given)
 
@@ -215,38 +215,38 @@ def test_a_checkpoint_of_something_else_is_no_agent(trained, tmp_path, change):
         Agent.load(path)
 
 
-def test_a_file_that_load_would_not_know_is_not_written(trained, tmp_path):
+def test_an_agent_is_not_saved_under_a_name_that_load_refuses(trained, tmp_path):
     for path in (tmp_path, tmp_path / "agent"):
         with pytest.raises(UsageError, match=r"\.safetensors"):
             trained[0].save(path)
     assert [*tmp_path.iterdir()] == []
 
 
-def test_what_has_no_weights_is_not_saved(tmp_path):
+def test_a_baseline_has_no_weights_to_save(tmp_path):
     with pytest.raises(UsageError, match="weights"):
         Agent.load("never_turn", scene="s_turn").save(tmp_path / "x.safetensors")
 
 
-def test_a_baseline_may_be_asked_for_workers_which_it_can_t_use():
+def test_a_baseline_that_is_given_workers_drives_without_them():
     agent = Agent.load("never_turn", scene="straight_road", num_workers=1)
     assert len(agent.evaluate(2)) == 2
 
 
-def test_the_package_has_it_by_name():
+def test_the_package_exports_the_agent():
     assert flowrep.Agent is Agent
 
 
 # The agents that come with flowrep: that they load, see what they were trained on, and drive.
 
 
-def test_every_scene_has_one_of_at_most_three_megabytes():
+def test_every_scene_has_a_pretrained_agent_of_at_most_three_megabytes():
     sizes = {path.stem: path.stat().st_size for path in PRETRAINED.glob("*.safetensors")}
     assert sorted(sizes) == SCENES
     assert max(sizes.values()) <= 3_000_000  # 1.7 MB for two maps of 60 × 60, 2.6 MB for three
 
 
 @pytest.mark.parametrize("scene", [pytest.param(s, marks=pytest.mark.slow) for s in SCENES])
-def test_it_drives_where_one_that_never_turns_does_not(scene):
+def test_a_pretrained_agent_drives_where_never_turning_fails(scene):
     episodes = Agent.load("pretrained", scene=scene, device="cpu").evaluate(20, seed=0)
     assert sum(each.outcome == "success" for each in episodes) >= LEAST[scene]
 
@@ -265,6 +265,6 @@ def test_a_scene_with_changes_is_driven_with_the_camera_of_training():
     assert agent.config.scene.camera.height_px == 60
 
 
-def test_a_scene_without_one_is_told_which_there_are():
+def test_a_scene_without_a_pretrained_agent_names_those_that_have_one():
     with pytest.raises(UsageError, match="straight_road"):
         Agent.load("pretrained", scene=replace(load_scene("s_turn"), name="my_street"))

@@ -82,7 +82,7 @@ def test_a_new_run_s_config_says_in_which_format_it_computes(monkeypatch, faster
     ],
 )
 @pytest.mark.usefixtures("own_module")
-def test_what_is_no_algorithm_is_refused(target, options, says):
+def test_a_target_that_is_no_algorithm_is_refused(target, options, says):
     with pytest.raises(UsageError, match=says):
         algorithm(named(target, **options))
 

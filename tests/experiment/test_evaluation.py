@@ -178,7 +178,7 @@ def test_another_agents_run_keeps_the_baselines_episodes(comparison, scene):
 
 
 @pytest.mark.parametrize("num_workers", [0, pytest.param(2, marks=pytest.mark.slow)])
-def test_of_an_evaluation_that_was_stopped_only_whole_groups_count(scene, num_workers):
+def test_a_stopped_evaluation_keeps_whole_groups_alone(scene, num_workers):
     """Short episodes end first: those of the second speed that ended are a biased sample."""
     few = ASKED | {"episodes": 6, "fps": [12]}
     whole, stopped = PairedEvaluation(**few), PairedEvaluation(**few)
@@ -196,7 +196,7 @@ def test_of_an_evaluation_that_was_stopped_only_whole_groups_count(scene, num_wo
     assert len(records) == 6
 
 
-def test_what_is_complete_is_saved_before_the_rest_is_run(scene):
+def test_each_finished_group_is_saved_before_the_next_begins(scene):
     asked = PairedEvaluation(**ASKED | {"episodes": 1, "fps": [12]}, baselines=["never_turn"])
     saved = []
     make = partial(make_env, scene, representations=["obj"])
@@ -204,7 +204,7 @@ def test_what_is_complete_is_saved_before_the_rest_is_run(scene):
     assert saved == [1, 2, 3, 4]
 
 
-def test_a_scene_is_known_by_all_that_it_is(scene):
+def test_a_scenes_id_changes_with_any_of_its_values(scene):
     assert scene_id(scene) == scene_id(replace(scene))
     assert scene_id(scene) != scene_id(replace(scene, time_limit_steps=3))
     assert len(scene_id(scene)) == 8

@@ -88,7 +88,7 @@ def test_two_policies_do_not_share_what_lies_beside_one(tmp_path):
         (TensorDict(), "NoneType"),
     ],
 )
-def test_what_is_no_action_is_named(given, said):
+def test_wrong_actions_of_a_policy_are_named(given, said):
     with pytest.raises(PolicyError, match=f"^policy 'mine' returned .*{said}"):
         ForeignFunction("mine", lambda maps: given, TASK)(maps())
 
@@ -115,7 +115,7 @@ def test_what_fails_in_a_policy_is_one_line_with_its_place(tmp_path, body, name,
 
 
 @pytest.mark.parametrize("name", ["nowhere.py:make", "no_such_package.part:make"])
-def test_what_is_not_there_is_named(name):
+def test_a_policy_that_does_not_exist_is_named(name):
     with pytest.raises((PolicyError, UsageError), match=name.partition(".")[0]):
         ForeignPolicy(name).built_for(TASK)
 

@@ -171,7 +171,7 @@ def cells(record, **changes):
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "metrics.csv", "evaluation.csv"])
-def test_a_folder_that_holds_a_run_is_no_place_for_a_new_one(tmp_path, name):
+def test_a_new_run_is_refused_in_a_folder_that_holds_one(tmp_path, name):
     run = RunFolder(tmp_path)
     run.check_is_new()
     (tmp_path / name).write_text("something")

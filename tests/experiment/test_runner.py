@@ -224,7 +224,7 @@ def saved(runner):
 
 
 @pytest.mark.slow
-def test_how_many_processes_drive_is_not_seen_in_what_comes_out(tmp_path, monkeypatch):
+def test_the_number_of_worker_processes_does_not_change_a_run(tmp_path, monkeypatch):
     alone = finish(tmp_path / "alone")
     monkeypatch.setattr("flowrep.envs.torchrl_env.available_cores", lambda: 64)
     first = new_run(tmp_path / "two", num_workers=2)  # which step while updates are taken
@@ -286,7 +286,7 @@ def test_a_run_whose_checkpoint_is_gone_keeps_its_results(tmp_path):
 
 
 @pytest.mark.slow
-def test_an_evaluation_that_was_cut_short_is_made_up_for_on_the_same_frames(tmp_path):
+def test_an_evaluation_that_was_cut_short_is_repeated_after_a_resume(tmp_path):
     asked = []
 
     class Stop(StopRequest):
@@ -349,7 +349,7 @@ def test_a_loss_that_is_no_number_from_the_start_leaves_no_checkpoint(tmp_path):
         ("representations.ego.scale=1e300", "'ego' is not finite"),
     ],
 )
-def test_a_policy_that_can_draw_no_action_ends_the_run_by_name(tmp_path, change, what):
+def test_a_run_ends_by_naming_the_map_or_loss_that_leaves_no_probabilities(tmp_path, change, what):
     more = ["total_frames=400", "log_every_frames=400", "representations=[ego]"]
     more += ["algorithm.batch_size=8", "algorithm.frames_per_update=2", change]
     runner = new_run(tmp_path, more=more)

@@ -60,7 +60,7 @@ def refusal(command, model, line):
         "algorithm.batch_size=2049 algorithm=ppo",
     ],
 )
-def test_a_value_that_can_not_be_is_named(line):
+def test_an_impossible_value_is_refused_by_its_key(line):
     key = line.split()[0].split("=")[0].lstrip("~+").split(".")[-1]
     assert key in refusal("train", TrainConfig, line)
 
@@ -77,7 +77,7 @@ def test_a_value_that_can_not_be_is_named(line):
         "algorithm._target_=my.Own +algorithm.mine=3",
     ],
 )
-def test_what_just_can_be_passes(line):
+def test_values_at_the_edge_of_what_is_possible_pass(line):
     assert composed(*line.split()).seed >= 0
 
 
@@ -108,7 +108,7 @@ def test_representations_keep_the_order_of_the_command_line():
         ("policy=mine.py:make representations=[ego]", "scene"),
     ],
 )
-def test_an_evaluation_that_can_not_be_is_refused(line, key):
+def test_an_impossible_evaluation_is_refused_by_its_key(line, key):
     assert key in refusal("evaluate", EvaluateConfig, line)
 
 
@@ -172,7 +172,7 @@ def test_a_configs_scene_is_checked_and_stored_as_it_was_written():
         (None, "scene: "),
     ],
 )
-def test_a_scene_that_is_none_is_refused_by_its_key(scene, says):
+def test_a_section_that_is_no_scene_is_refused_by_its_key(scene, says):
     with pytest.raises(UsageError) as caught:
         validated(TrainConfig, plain("train") | {"scene": scene})
     assert str(caught.value).startswith(says)

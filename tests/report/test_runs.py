@@ -79,7 +79,7 @@ def test_every_baseline_is_drawn():
     assert set(DRAWN_BASELINES) == set(get_args(BaselineName))
 
 
-def test_what_a_run_is_comes_from_its_config(tmp_path):
+def test_scene_stack_and_seed_of_a_run_come_from_its_config_not_its_folder(tmp_path):
     path = run_in(tmp_path, "misnamed_ego_s7", stack="obj+seg2+ego", seed=3, scene="s_turn")
     run = read_run(path)
     assert (run.scene, run.stack, run.seed, run.fps) == ("s_turn", "ego+obj+seg2", 3, 12.0)

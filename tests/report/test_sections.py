@@ -66,7 +66,7 @@ def test_p_is_corrected_for_the_comparisons_of_its_block(tmp_path):
     assert (low[3], low[6]) == ("lower" if low[0].startswith("ego") else "higher", "100")
 
 
-def test_table_iii_leaves_time_outs_out_and_tells_the_ratio(tmp_path):
+def test_table_iii_leaves_time_outs_out_and_has_the_ratio(tmp_path):
     # Two seeds: 1 of 4 and 3 of 20 failures are out of bounds: 20 %, 80 %, 0.25. As 4 of 24
     # together, or with the time-outs, it would be less.
     run_in(tmp_path, "a", "occc" + "t" * 4 + "s")
@@ -91,7 +91,7 @@ def test_table_iii_is_of_low_and_high_speed_together_where_both_were_driven(tmp_
     assert "Low and high speed" in table.caption
 
 
-def test_a_cell_without_runs_is_missing_and_so_is_what_needs_it(tmp_path):
+def test_a_cell_without_runs_is_missing_and_so_are_means_that_need_it(tmp_path):
     run_in(tmp_path, "a", {"low": "sssc", "normal": "sscc", "high": "sccc"}, stack="ego")
     run_in(tmp_path, "b", {"low": "ssss", "normal": "ssss"}, stack="ego+obj")
     run_in(tmp_path, "c", {"low": "ssss"}, stack="raw", scene="straight_road")
@@ -156,7 +156,7 @@ def test_runs_whose_configs_differ_are_never_pooled_and_the_keys_are_named(tmp_p
     assert rows_in(differing) == [("algorithm.tau", "0.005", "0.02")]
 
 
-def test_a_baseline_is_told_beside_its_own_config_alone(tmp_path):
+def test_a_baseline_stands_beside_the_runs_of_its_config_alone(tmp_path):
     # Never turning succeeds in 3 of 4 and, with less time, in 1 of 4; both as one would be 1 of 4.
     for name, reached, other in (("a", "sssc", {}), ("b", "sccc", {"scene__time_limit_steps": 90})):
         config = config_of("s_turn", **other)
@@ -214,7 +214,7 @@ def test_a_learning_curve_is_of_the_speed_and_frame_rate_of_training(tmp_path):
     assert curve == ([(500, 0.5), (1000, 0.75)], [(500, 0.1)])
 
 
-def test_numbers_are_told_with_their_intervals():
+def test_numbers_are_printed_with_their_intervals():
     assert percent(Estimate(0.854, 0.791, 0.901)) == "85 [79–90]"
     assert points(Estimate(0.123, -0.031, 0.2)) == "+12 [−3, +20]"
     assert points(Estimate(0.25, -2.93, 3.43)) == "+25 [too few runs]"

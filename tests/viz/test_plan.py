@@ -54,7 +54,7 @@ def test_the_legend_names_only_what_the_scene_has(layout):
     assert not any("exit" in name for name in straight)
 
 
-def test_nothing_that_stands_is_cut_off(layout):
+def test_buildings_and_obstacles_lie_wholly_within_a_plan(layout):
     (axes,) = draw_plan(layout).axes
     (x0, x1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
     for box in (*layout.buildings, *layout.obstacles):
