@@ -218,6 +218,13 @@ def as_pose(numbers: NDArray[np.float64], source: object, **options: Any) -> Pos
     return pose
 
 
+def fixed_pose(numbers: Sequence[float] | None, source: str) -> Pose:
+    """Returns the pose `[4, 4]` of 3 (x, y, z), 7 (with qx, qy, qz, qw), 12 or 16 numbers."""
+    given = np.array([0.0, 0.0, 0.0] if numbers is None else numbers)
+    given = np.array([*given, 0.0, 0.0, 0.0, 1.0]) if len(given) == 3 else given
+    return as_pose(given, source, layout="xyz_xyzw" if len(given) == 7 else "matrix")
+
+
 class Rig:
     """Brings a frame's picture and depth, as they are stored, to one grid without distortion.
 

@@ -303,10 +303,7 @@ class DeclaredRecording(Recording):
             numbers[lost] = numbers[~lost][0]  # so that errors name the wrong row
             poses = as_pose(numbers, path, **options)
             poses[:, :3, 3] *= self.pose_unit_m
-            if self.marker_from_cam is not None:
-                fixed = "xyz_xyzw" if len(self.marker_from_cam) == 7 else "matrix"
-                marker = np.array(self.marker_from_cam)
-                poses @= as_pose(marker, "marker_from_cam", layout=fixed)
+            poses @= calibration.fixed_pose(self.marker_from_cam, "marker_from_cam")
             if self._rig.colour_from_depth is not None:
                 poses @= np.linalg.inv(self._rig.colour_from_depth)  # they are the depth camera's
             self._poses = matching.poses_between(poses, late, share)
@@ -333,19 +330,17 @@ class DeclaredRecording(Recording):
             numbers = self._numbers_in(given)
         self._K_numbers = numbers.repeat(len(lacking) // len(numbers), axis=0)
         self._camera(0, (2, 2), source)  # or an error, early
-        self._depth_numbers = colour_from_depth = None
-        shift = np.array(self.colour_from_depth or 3 * [0.0])
-        if len(shift) == 3:
-            shift = np.column_stack([np.eye(3), shift]).ravel()
-        pose = as_pose(shift, "colour_from_depth")
+        self._depth_numbers = None
+        pose: Any = calibration.fixed_pose(self.colour_from_depth, "colour_from_depth")
         if self.depth_intrinsics is not None:
             self._depth_numbers = self._numbers_in(self.depth_intrinsics)
             K = camera_matrix(self._depth_numbers, (2, 2), self.first_pixel_centre)
             geometry.check_intrinsics("format.depth_intrinsics", torch.from_numpy(K))
-            colour_from_depth = pose
         elif np.any(pose != np.eye(4)):
             raise SequenceError("colour_from_depth", "needs format.depth_intrinsics, too")
-        self._rig = calibration.Rig(self.distortion, self.lens, colour_from_depth)
+        else:
+            pose = None
+        self._rig = calibration.Rig(self.distortion, self.lens, pose)
         return {"without intrinsics": lacking}
 
     def _numbers_in(self, given: str | Sequence[float]) -> Floats:

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrep.extras import require
-from flowrep.sequences.calibration import Lens, Matrix, Rig, as_pose, camera_matrix, lens_of
+from flowrep.sequences import calibration, matching
+from flowrep.sequences.calibration import Lens, Matrix, as_pose
 from flowrep.sequences.files import decoded, regular
-from flowrep.sequences.matching import keep, match_depth, match_times, poses_between, positions
 from flowrep.sequences.recording import Frame, Pose, Recording, SequenceError
 
 # Encodings by their type and channels; of colour, the order in which red, green and blue stand.
@@ -50,7 +50,7 @@ class RosBag(Recording):
         camera_info: topic of the pictures' calibration, by default beside them.
         world: frame in which poses are given; None is the root of the tree.
         frame: frame of the pictures, if it isn't the one that their header names.
-        frame_from_cam: x, y, z, qx, qy, qz, qw of the optical frame in it, if tf_static lacks it.
+        frame_from_cam: the optical frame's pose in it, if tf_static lacks it: see `fixed_pose`.
         tolerance_s: longest time between a picture and its depth, or a transform.
     """
 
@@ -85,15 +85,13 @@ class RosBag(Recording):
             depth_stamps, depth_optical = self._index(self._depth)
             self.K, lens = self._camera(camera_info, self._rgb)
             self._edges = self._transforms()
-            fixed = np.eye(4)
-            if frame_from_cam is not None:
-                fixed = as_pose(np.array(frame_from_cam), "frame_from_cam", layout="xyz_xyzw")
+            fixed = calibration.fixed_pose(frame_from_cam, "frame_from_cam")
             self._choose(stamps, depth_stamps, frame or optical, world, fixed)
             self._K_depth, colour_from_depth = self.K, None
             if depth_optical != optical:
                 self._K_depth, _ = self._camera(None, self._depth)
                 colour_from_depth = self._between_cameras(optical, depth_optical)
-            self._rig = Rig(*lens, colour_from_depth)
+            self._rig = calibration.Rig(*lens, colour_from_depth)
 
     @contextmanager
     def _naming(self) -> Iterator[None]:
@@ -112,7 +110,7 @@ class RosBag(Recording):
         """Matches depth and transforms to pictures, and says how well they fit."""
         start = min(stamps[0], depth_stamps[0])
         times_s, depth_times_s = ((np.array(x) - start) * 1e-9 for x in (stamps, depth_stamps))
-        rows = match_depth(depth_times_s, times_s, self.tolerance_s)
+        rows = matching.match_depth(depth_times_s, times_s, self.tolerance_s)
         said = [f"pictures are {self._rgb}, depth {self._depth}"]
         if (rows >= 0).any():
             lag_s = np.median((depth_times_s[rows] - times_s)[rows >= 0])
@@ -131,8 +129,8 @@ class RosBag(Recording):
             remedy = "give format.frame= and format.frame_from_cam=, or poses are estimated"
             said.append(f"no transform moves {frame} (tf has those of {there}): {remedy}")
         remedy = "raise format.tolerance_s, or give another format.world"
-        kept, notes = keep([*map(_name, stamps)], left_out, self.path, remedy)
-        places = positions(times_s)
+        kept, notes = matching.keep([*map(_name, stamps)], left_out, self.path, remedy)
+        places = matching.positions(times_s)
         # The stamps of a picture and its depth, its pose, its number if no frame were missing.
         self._moments = [(stamps[i], depth_stamps[rows[i]], poses[i], int(places[i])) for i in kept]
         self.count, self.notes = len(kept), (*said, *notes)
@@ -194,9 +192,9 @@ class RosBag(Recording):
         is_ros1, size = hasattr(info, "K"), (info.height, info.width)
         K, D, P = (info.K, info.D, info.P) if is_ros1 else (info.k, info.d, info.p)
         is_rectified = "rect" in topic  # ROS's name for pictures without distortion, of P
-        matrix = camera_matrix(P if is_rectified else K, size, 0.0, source)
+        matrix = calibration.camera_matrix(P if is_rectified else K, size, 0.0, source)
         distortion = [*D] if np.any(D) and not is_rectified else []
-        return matrix, (distortion, lens_of(info.distortion_model))
+        return matrix, (distortion, calibration.lens_of(info.distortion_model))
 
     # Where the camera was.
 
@@ -235,9 +233,9 @@ class RosBag(Recording):
                 continue
             order = np.argsort(edge.stamps, kind="stable")
             at_s = (np.array(edge.stamps)[order] - start) * 1e-9
-            rows, share = match_times(at_s, times_s, self.tolerance_s, interpolate=True)
+            rows, share = matching.match_times(at_s, times_s, self.tolerance_s, interpolate=True)
             gap_s = max(gap_s, float(np.ptp(at_s[rows], axis=0)[rows[0] >= 0].max(initial=0.0)))
-            poses = poses_between(np.array(edge.poses)[order], rows, share) @ poses
+            poses = matching.poses_between(np.array(edge.poses)[order], rows, share) @ poses
             poses[rows[0] < 0] = np.nan
         return poses, gap_s
 

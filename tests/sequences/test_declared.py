@@ -376,7 +376,7 @@ def test_brackets_in_a_name_are_brackets(moments, tmp_path):
         ({"rows_where": ["first", 0]}, r"format\.rows_where"),
         ({"rows_where": [0]}, r"format\.rows_where"),
         ({"dept": "d/*"}, r"format\.dept"),
-        ({"marker_from_cam": [0.1, 0.2, 0.3]}, "marker_from_cam: has 3 numbers"),
+        ({"marker_from_cam": [0.1, 0.2]}, "marker_from_cam: has 2 numbers"),
         ({"colour_from_depth": [1.0, 2.0]}, "colour_from_depth: has 2 numbers"),
         ({"colour_from_depth": [0.1, 0.0, 0.0]}, "colour_from_depth: .*depth_intrinsics"),
     ],

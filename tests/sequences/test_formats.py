@@ -26,32 +26,29 @@ def brute_force(depth, K, pose, K_before, pose_before):
     return (pixels[:2] - seen[:2] / seen[2]).reshape(2, *depth.shape)
 
 
-def zoomed(factor):
-    return np.diag([factor, factor, 1.0]) @ K
+def camera(i, scale):
+    """fx, fy, cx, cy of an autofocus that changes by 2 % a frame, for pictures this much larger."""
+    K_i = scale * np.diag([1.02**i, 1.02**i, 1.0]) @ K
+    return [float(K_i[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2))]
 
 
 def write_stray_scanner(folder):
-    """Pictures four times as large as depth, and an autofocus that changes K by 2 % a frame."""
+    """Pictures four times as large as depth."""
     moments = make_moments(unit_m=0.001)
     large = [m.rgb.repeat(4, 0).repeat(4, 1) for m in moments]
     folder.mkdir()
     imageio.imwrite(folder / "rgb.mp4", np.stack(large), plugin="FFMPEG", fps=30, quality=10)
-    header = "timestamp, frame, x, y, z, qx, qy, qz, qw, fx, fy, cx, cy, distortion_center_x"
-    lines = [header]
+    lines = ["timestamp, frame, x, y, z, qx, qy, qz, qw, fx, fy, cx, cy, distortion_center_x"]
     for i, moment in enumerate(moments):
         put(folder / f"depth/{i:06d}.png", synthetic.stored(moment.depth, 0.001))
         trust = np.full((HEIGHT, WIDTH), 2, np.uint8)
         trust[3, 4], trust[3, 5] = 0, 1
         put(folder / f"confidence/{i:06d}.png", trust)
-        camera = 4 * zoomed(1.02**i)
-        focus = [camera[0, 0], camera[1, 1], camera[0, 2], camera[1, 2]]
-        pose = [float(x) for x in quaternion_line(moment.world_from_cam).split()]
-        lines.append(", ".join(map(repr, [100 + i / 60, i, *pose, *map(float, focus)])) + ", ")
+        pose = quaternion_line(moment.world_from_cam).split()
+        lines.append(", ".join(map(str, [100 + i / 60, i, *pose, *camera(i, 4)])) + ", ")
     put(folder / "odometry.csv", lines)
-    put(
-        folder / "camera_matrix.csv",
-        [", ".join(map(str, row)) for row in np.diag([4.0, 4.0, 1.0]) @ K],
-    )
+    rows = np.diag([4.0, 4.0, 1.0]) @ K
+    put(folder / "camera_matrix.csv", [", ".join(map(str, row)) for row in rows])
     return moments
 
 
@@ -66,9 +63,7 @@ def write_record3d(folder):
         opengl = moment.world_from_cam @ np.diag([1.0, -1.0, -1.0, 1.0])
         *position, x, y, z, w = map(float, quaternion_line(opengl).split())
         metadata["poses"].append([x, y, z, w, *position])
-        camera = 2 * zoomed(1.02**i)
-        focus = [camera[0, 0], camera[1, 1], camera[0, 2], camera[1, 2]]
-        metadata["perFrameIntrinsicCoeffs"].append(focus)
+        metadata["perFrameIntrinsicCoeffs"].append(camera(i, 2))
         metadata["frameTimestamps"].append(i / 60)
     put(folder / "metadata.json", [json.dumps(metadata)])
     return moments
