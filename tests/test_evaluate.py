@@ -11,7 +11,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 pytest.importorskip("pybullet", reason="agents are evaluated in the simulated street")
 
-from examples import export_agent
+from examples import export_agent, share_agent
 from flowrep.agent import CheckpointError
 from flowrep.config.options import validated
 from flowrep.config.usage import UsageError
@@ -338,6 +338,18 @@ def test_an_agent_that_the_example_exports_drives_as_it_did_in_flowrep(tmp_path)
         seen = env.rollout(4)[:, -1]
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         assert torch.equal(act(seen), agent.policy(seen)["action"])
+
+
+def test_an_agent_packed_for_a_hub_is_the_runs_beside_a_card_of_its_episodes(untouched, tmp_path):
+    evaluate(asked(f"run={untouched.path}", "speed=[low,high]"))
+    share_agent.pack(untouched.path, tmp_path / "shared")
+    card = (tmp_path / "shared" / "README.md").read_text("utf-8")
+    rows = [line.split(" | ") for line in card.splitlines() if line.startswith("| straight_road")]
+    assert [row[2:6] for row in rows] == [["greedy", x, "12.0", "2"] for x in ("low", "high")]
+    assert "# straight_road: obj, 0 frames" in card
+    shared = Agent.load(tmp_path / "shared" / "agent.safetensors", device="cpu").policy
+    mine = Agent.load(untouched.path, device="cpu").policy
+    assert all(map(torch.equal, shared.parameters(), mine.parameters()))
 
 
 def test_a_policy_without_actions_leaves_a_line_and_no_row(tmp_path, capsys):
