@@ -43,8 +43,8 @@ def pack(run: Path, folder: Path) -> None:
     ends = defaultdict(list)
     for row in RunFolder(run).read_episodes():
         if row["evaluation"] != "training":
-            condition = (row[key] for key in ("scene", "scene_id", "policy", "speed", "fps"))
-            ends[" | ".join(condition)].append(row["outcome"])
+            cells = (row[key] for key in ("scene", "scene_id", "policy", "speed", "fps"))
+            ends[" | ".join(cells)].append(row["outcome"])
     rows = []
     for condition, outcomes in ends.items():
         share, low, high = (100 * each for each in outcome_shares(outcomes)["success"])
