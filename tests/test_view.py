@@ -46,7 +46,7 @@ def asked(*overrides):
 
 
 def show(*overrides):
-    config = asked(*SMALL, *overrides)
+    config = asked("scene=s_turn", "scene.time_limit_steps=3", *SMALL, *overrides)
     agent = agent_of(config)
     with closing(Film(agent)) as film:
         view(config, agent, film)
@@ -111,8 +111,7 @@ def test_each_scene_and_policy_has_a_folder():
 def test_a_view_replaces_the_files_of_an_earlier_one_and_no_others(tmp_path):
     for name in (*FILES, "notes.txt"):
         (tmp_path / name).write_text("old")
-    short = "scene=s_turn", "scene.time_limit_steps=3", "episodes=1"
-    show(*short, "video=false", f"output={tmp_path}")
+    show("video=false", f"output={tmp_path}")
     left = {path.name for path in tmp_path.iterdir()}
     assert left == {*FILES, "notes.txt"} - {"episode.mp4"}
     assert [path.name for path in tmp_path.iterdir() if path.read_bytes() == b"old"] == [
@@ -125,7 +124,7 @@ def test_a_view_for_which_the_disk_has_no_room_leaves_an_earlier_one(tmp_path, m
         (tmp_path / name).write_text("old")
     monkeypatch.setattr(files, "_flush", fails)
     with pytest.raises(OSError, match=r"sheet\.png"):
-        show("scene.time_limit_steps=3", "episodes=1", "video=false", f"output={tmp_path}")
+        show("video=false", f"output={tmp_path}")
     assert [(tmp_path / name).read_text() for name in FILES] == ["old"] * len(FILES)
 
 

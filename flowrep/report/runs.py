@@ -59,7 +59,7 @@ class Run:
     config: Mapping[str, Any]
     episodes: Columns  # of evaluation.csv
     metrics: Columns  # of metrics.csv, nan where a cell is empty
-    folder: Path | None = None  # where films and drives may be
+    folder: Path | None = None  # None of a packed run
     machine: Mapping[str, str] = field(default_factory=dict)  # that trained it, of a packed run
 
     def __post_init__(self) -> None:

@@ -66,7 +66,7 @@ class ReportSection(NamedTuple):
 
 
 class Report(NamedTuple):
-    """What a page shows of runs, apart from their drives."""
+    """What a page shows of runs."""
 
     runs: tuple[Run, ...]
     warnings: tuple[str, ...]
