@@ -5,10 +5,11 @@
 1. One view: a planner drives, and every view is drawn by both renderers, with all people in place.
 2. A frame of 32 envs in one process with ego and obj and random actions, without policy and replay
    memory.
-3. Frames per second by number of worker processes, with `--workers 0 1 4`; 0 is this process alone.
+3. A frame of one gymnasium env: its sensors alone, and with ego and obj, in turns.
+4. Frames per second by number of worker processes, with `--workers 0 1 4`; 0 is this process alone.
 
-The first two are CPU times, so that other work on the machine does not count; the third is wall
-time. With `--device cuda` only the third runs.
+The first three are CPU times, so that other work on the machine does not count; the fourth is wall
+time. With `--device cuda` only the fourth runs.
 """
 
 import argparse
@@ -21,6 +22,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import gymnasium as gym
 import torch
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
@@ -30,6 +32,7 @@ if __name__ == "__main__":
 from benchmarks.pybullet_view import PyBulletView
 from flowrep.baselines import Planner
 from flowrep.envs import StreetEnv, make_env
+from flowrep.envs.gym_wrappers import make_street
 from flowrep.envs.street_env import Episode
 from flowrep.envs.vector_env import StreetVectorEnv
 from flowrep.scenes import load_scene, scene_names
@@ -142,6 +145,23 @@ def shares(env: EnvBase, take: Callable[[int], float], steps: int) -> list[float
     return [drive, sense, represent, whole - drive - sense - represent]
 
 
+def gym_row(name: str, size: int, rounds: int) -> str:
+    envs = [make_street(in_size(name, size), maps) for maps in ((), REPRESENTATIONS)]
+    for env in envs:
+        env.reset(seed=0)
+
+    def steps(env: gym.Env) -> None:
+        for _ in range(30):
+            _, _, terminated, _, _ = env.step(0)
+            if terminated:
+                env.reset()
+
+    turns = [[timed(lambda: steps(env))[0] / 30 for env in envs] for _ in range(10 * rounds)]  # noqa: B023
+    sensors, flow = (statistics.median(each) for each in zip(*turns))
+    ratio = statistics.median(both / alone for alone, both in turns)
+    return f"| {name} | {size} | {1e3 / sensors:.0f} | {1e3 / flow:.0f} | {ratio:.2f} |"
+
+
 def worker_row(
     name: str, size: int, num_envs: int, workers: int, steps: int, device: torch.device
 ) -> str:
@@ -183,6 +203,11 @@ def main() -> None:
         print("| --- | --- | --- | --- | --- | --- | --- | --- |")
         for row in rows:
             print(frame_row(*row, args.num_envs, args.steps, args.rounds), flush=True)
+        print("\none gymnasium env, one thread, frames/s of CPU time, and the ratio of their times")
+        print("| scene | pixels | sensors alone | with ego and obj | ratio |")
+        print("| --- | --- | --- | --- | --- |")
+        for row in rows:
+            print(gym_row(*row, args.rounds), flush=True)
     if args.workers:
         print(f"\n{args.num_envs} envs, {args.device}\n| scene | pixels | workers | frames/s |")
         print("| --- | --- | --- | --- |")

@@ -33,6 +33,8 @@ DEPTH_KEY: NestedKey = ("sensor", "depth")
 RAW_KEYS: list[NestedKey] = [DEPTH_KEY, ("sensor", "instance"), ("sensor", "instance_motion")]
 EGO_KEYS: list[NestedKey] = [DEPTH_KEY, ("sensor", "prev_from_curr")]
 
+_ROWS = 30  # rows or columns at least that estimate noise: a median of 900 values is good enough
+
 # K itself, or the key under which the env gives it.
 Intrinsics: TypeAlias = Tensor | Sequence[Sequence[float]] | NestedKey
 
@@ -340,6 +342,9 @@ class FlowFactorize(FlowTransform):
         movable: key of a mask or ids `[*B, 1, H, W]`, 0 where nothing can move by itself, such as a
             detector's mask of people. Object flow is 0 there, whatever an error of the camera's
             motion (odometry's drift) would leave.
+        noise_scales: object flow of up to this many times its noise is 0; 3 is a good choice where
+            no mask says what can move. The noise is a robust estimate from the frame, see
+            `residual_noise`, and 0 if most pixels agree exactly with the camera's motion.
         compiled: see `RawFlow`.
         in_keys: raw flow (in px/step, unscaled), depth and camera motion; for ego alone, only the
             last two.
@@ -374,6 +379,7 @@ class FlowFactorize(FlowTransform):
         outputs: Sequence[str] = ("ego", "obj"),
         scale: float | Mapping[str, float] = 1.0,
         movable: NestedKey | None = None,
+        noise_scales: float = 0.0,
         compiled: bool = False,
         in_keys: Keys | None = None,
         out_keys: Keys | None = None,
@@ -391,6 +397,10 @@ class FlowFactorize(FlowTransform):
         options |= {"prev_intrinsics": prev_intrinsics}
         super().__init__(intrinsics, reads, keys, out_keys, **options)
         self.has_movable = movable is not None
+        wanted = "a finite number of at least 0"
+        self.noise_scales = checked_number("noise_scales", noise_scales, wanted, lambda x: x >= 0)
+        if self.noise_scales and "obj" not in outputs:
+            raise ValueError(f"noise_scales={noise_scales} is for obj, which {outputs} lacks")
         if self.scales.get("raw", 1.0) != 1.0:
             check_distinct_keys(self)
 
@@ -403,6 +413,11 @@ class FlowFactorize(FlowTransform):
             ego, valid = geometry.ego_flow(depth, K, motion, prev_K=prev_K)
             return self._chosen({"ego": ego}, valid)
         ego, obj, valid = geometry.factorize(raw[0], depth, K, motion, prev_K=prev_K)
+        if self.noise_scales:
+            # `norm` along the channels takes 40 times as long.
+            length = torch.hypot(obj[..., :1, :, :], obj[..., 1:, :, :])
+            noise = residual_noise(length, depth, valid)
+            obj = torch.where(length > self.noise_scales * noise, obj, 0.0)
         if self.has_movable:
             obj = torch.where(movable != 0, obj, 0.0)
         flows, known = {"ego": ego, "obj": obj}, None
@@ -410,6 +425,32 @@ class FlowFactorize(FlowTransform):
             flows["raw"] = torch.where(raw[0].isfinite(), raw[0], 0.0)
             known = raw[0].isfinite().all(-3, keepdim=True)
         return self._chosen(flows, valid, known)
+
+
+def residual_noise(length: Tensor, depth: Tensor, known: Tensor) -> Tensor:
+    """Returns the usual length of residuals at each pixel's depth; all are `[*B, 1, H, W]`.
+
+    An error of the camera's rotation moves all pixels alike, an error of its translation by f / Z.
+    The length is therefore a line in 1 / Z, neither falling nor negative, through the medians of
+    the nearer and of the farther half of the known pixels (Tukey's resistant line). What moves by
+    itself doesn't change it, as long as it covers less than half of each.
+    """
+    near = depth.reciprocal()
+    step = max(1, min(depth.shape[-2:]) // _ROWS)
+    sampled = (x[..., ::step, ::step] for x in (length, near, known))
+    lengths, nearness, is_known = sampled
+    is_known = is_known.view(torch.uint8) != 0  # as in `masked_flow`
+
+    def median(of: Tensor, where: Tensor) -> Tensor:
+        return torch.where(where, of, math.nan).flatten(-2).nanmedian(-1).values[..., None, None]
+
+    is_far = nearness <= median(nearness, is_known)
+    (x, y), (x_far, y_far) = (
+        (median(nearness, half & is_known), median(lengths, half & is_known))
+        for half in (~is_far, is_far)
+    )
+    slope = torch.where(x > x_far, (y - y_far) / (x - x_far), 0.0).clamp(min=0.0)
+    return (y_far - slope * x_far).clamp(min=0.0) + slope * near
 
 
 def _highest_id(ids: TensorSpec) -> int | None:

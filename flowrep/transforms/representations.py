@@ -33,7 +33,7 @@ _OPTIONS: dict[str, tuple[type[Transform], tuple[str, ...]]] = {
     "depth": (Depth, ("range_m", "missing")),
     "raw": (RawFlow, _FLOW_OPTIONS),
     "ego": (FlowFactorize, _FLOW_OPTIONS),
-    "obj": (FlowFactorize, _FLOW_OPTIONS),
+    "obj": (FlowFactorize, (*_FLOW_OPTIONS, "noise_scales")),
 }
 FRAMES_OF = {"seg2": "seg", "depth2": "depth"}  # the last k frames
 FLOWS = ("raw", "ego", "obj")  # of two channels, u and v
@@ -141,7 +141,8 @@ def representation_stack(
     # RawFlow factorises exact flow in the same pass, but not by noisy depth.
     by_pass = [name for name in flows if name == "raw" or keys["depth"] == DEPTH_KEY]
     # Elsewhere, obj needs flow in px/step, as does an estimate of the motion.
-    splits = "obj" in flows and not (estimator is None and "obj" in by_pass)
+    noise_scales = flows.get("obj", {}).get("noise_scales", 0.0)
+    splits = "obj" in flows and (estimator is not None or "obj" not in by_pass or noise_scales)
     needs_unscaled = splits or estimates_motion
     unscaled = _UNSCALED_KEY if estimator is None else _ESTIMATED_FLOW_KEY
     sources: list[Transform] = []
@@ -169,6 +170,7 @@ def representation_stack(
             compiled=compiled,
             outputs=list(factors),
             scale={name: options["scale"] for name, options in factors.items()},
+            noise_scales=noise_scales,
             in_keys=[*([] if set(factors) == {"ego"} else [unscaled]), keys["depth"], motion_key],
         )
         transforms.append(factorize)

@@ -12,6 +12,7 @@ from torchrl.envs import TransformedEnv, check_env_specs
 from torchrl.envs.transforms import Compose, RenameTransform
 
 from flowrep import geometry
+from flowrep.geometry.pose import rotation_from_vector
 from flowrep.transforms import (
     AdaptDepth,
     EstimateCameraMotion,
@@ -221,6 +222,41 @@ def test_drift_of_odometry_leaves_no_object_flow_where_nothing_can_move(dtype):
     torch.testing.assert_close(drifted[:, 0, 1], exact[:, 0, 1] + torch.tensor([0.1, 0.0]))
     with pytest.raises(ValueError, match="movable"):
         FlowFactorize(K, outputs=["ego"], movable="people")
+
+
+def street(batch: int = 3) -> TensorDict:
+    """Returns views of 24 x 30 px: a floor before a wall, and a person who walks past the wall."""
+    rows = torch.arange(24.0)[:, None]
+    depth = torch.where(rows > 14, 60.0 / (rows - 12), 20.0).expand(batch, 1, 24, 30).clone()
+    instance = torch.zeros(batch, 1, 24, 30, dtype=torch.uint8)
+    depth[..., 8:16, 10:14], instance[..., 8:16, 10:14] = 12.0, 1
+    depth[..., 0, 5:8] = torch.tensor([math.inf, math.nan, 0.0])
+    motions = torch.eye(4).repeat(batch, 2, 1, 1)
+    motions[..., 2, 3] = 0.8
+    motions[:, 1, 0, 3] = 0.3
+    sensor = {"depth": depth, "instance": instance, "instance_motion": motions}
+    sensor["prev_from_curr"] = motions[:, 0].clone()
+    return TensorDict({"sensor": TensorDict(sensor, [batch])}, [batch])
+
+
+def test_drift_is_below_the_threshold_and_who_moves_above_it():
+    K, td = torch.tensor([[30.0, 0, 15], [0, 30, 12], [0, 0, 1]]), street()
+    quiet = FlowFactorize(K, noise_scales=3.0)
+    exact = FlowFactorize(K)(RawFlow(K)(td))["obj"].clone()
+    assert torch.equal(quiet(td.clone())["obj"], exact)
+    td["sensor", "prev_from_curr"][1, :3, 3] += torch.tensor([0.02, 0.01, -0.02])
+    turn = rotation_from_vector(torch.tensor([2e-3, -1e-3, 0.0]))
+    td["sensor", "prev_from_curr"][2, :3, :3] = turn
+    person = (td["sensor", "instance"] == 1).expand_as(exact)
+    drifted = FlowFactorize(K)(td.clone())["obj"]
+    assert (drifted[1:] != 0).all(1).float().mean() > 0.9
+    obj = quiet(td.clone())["obj"]
+    assert not obj[~person].any()
+    assert torch.equal(obj[person], drifted[person])
+    one = torch.stack([quiet(each)["obj"] for each in td])
+    assert torch.equal(obj, one)
+    with pytest.raises(ValueError, match="noise_scales"):
+        FlowFactorize(K, outputs=["ego"], noise_scales=3.0)
 
 
 @pytest.mark.parametrize("make", [RawFlow, FlowFactorize, partial(AdaptDepth, "ray_length")])
