@@ -85,10 +85,11 @@ def swatch(name: str) -> Patch:
 
 def front(variant: int) -> Patch:
     """Returns a variant's house front; there are `NUM_FRONTS`, which repeat."""
-    (height, width), inset = _FRONT_PX, 0.5  # pixels from its border, which half a texel lies on
-    texels = [FRONT_SIZE * inset / side for side in (width, height)]
-    texels += [FRONT_SIZE * (side - inset) / side for side in (width, height)]
-    return Patch(len(PAINTS) + variant % NUM_FRONTS, *texels)
+    # From the centre of the picture's first pixel to that of its last.
+    u0, u1, v0, v1 = [
+        FRONT_SIZE * at / side for side in _FRONT_PX[::-1] for at in (0.5, side - 0.5)
+    ]
+    return Patch(len(PAINTS) + variant % NUM_FRONTS, u0, v0, u1, v1)
 
 
 def upper_storeys(variant: int) -> Patch:
