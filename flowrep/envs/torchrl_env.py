@@ -101,8 +101,8 @@ def make_env(
             and depth.
         noise: errors of a depth camera and of odometry, see `representation_stack`; a repeated
             episode has the same noise.
-        compiled: whether flow is computed by `torch.compile`: up to two and a half times as fast on
-            a CPU and equal up to rounding, after up to a minute of compilation.
+        compiled: whether flow is computed by `torch.compile`, equal up to rounding, after up to a
+            minute of compilation. On a CPU, numba, which computes it otherwise, is faster.
 
     Raises:
         SceneError: the scene is invalid.

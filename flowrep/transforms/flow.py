@@ -226,10 +226,10 @@ class RawFlow(FlowTransform):
         scale: factor on the flow, finite and not 0; the frame rate gives pixels per second. Or a
             mapping from output to factor.
         compiled: whether `compute` runs through `torch.compile`, which is about five times as fast
-            on a CPU and equal up to rounding. Compiling takes up to a minute; later processes take
-            the result from torch's cache. If False, and numba is installed, large float32 batches
-            on a CPU are computed by numba, two to five times as fast as by PyTorch and bit for bit
-            the same.
+            as PyTorch on a CPU and equal up to rounding. Compiling takes up to a minute; later
+            processes take the result from torch's cache. If False, and numba is installed, float32
+            maps on a CPU are computed by numba, bit for bit as by PyTorch and faster than compiled;
+            a single small one only if something has imported numba, as flowrep's streets do.
         in_keys: depth, instance ids, and one motion for each instance; for ego and obj, also the
             camera's motion.
         out_keys: one key for each output; their names by default. The mask's key is raw's with
