@@ -342,7 +342,7 @@ class FlowFactorize(FlowTransform):
         movable: key of a mask or ids `[*B, 1, H, W]`, 0 where nothing can move by itself, such as a
             detector's mask of people. Object flow is 0 there, whatever an error of the camera's
             motion (odometry's drift) would leave.
-        noise_scales: object flow of up to this many times its noise is 0; 3 is a good choice where
+        noise_scales: object flow of up to this many times its noise is 0; 2 is a good choice where
             no mask says what can move. The noise is a robust estimate from the frame, see
             `residual_noise`, and 0 if most pixels agree exactly with the camera's motion.
         compiled: see `RawFlow`.
