@@ -12,19 +12,26 @@ from torch import Tensor
 from torch.nn import functional
 
 from flowrep import geometry
+from flowrep.diagnosis import explanation, pictures
+from flowrep.diagnosis.competition import Competition
 from flowrep.diagnosis.fit import (
     EYE,
     Pairs,
+    flow_of,
     length,
     median,
-    refined,
     residuals,
     sampled,
     seen_before,
 )
-from flowrep.diagnosis.recordings import FROZEN, no_diagnosis, note_on_untested, reasons_untestable
+from flowrep.diagnosis.recordings import (
+    no_diagnosis,
+    note_on_untested,
+    reasons_untestable,
+    tested,
+)
 from flowrep.diagnosis.rivals import rivals_of
-from flowrep.diagnosis.verdict import Diagnosis, diagnosed
+from flowrep.diagnosis.verdict import Diagnosis, judged
 
 _PAIRS = 8  # that are tested at most, to save time
 # A body counts in each frame that shows it.
@@ -33,8 +40,6 @@ _MOVED_PX = 0.25  # least flow or residual of a body that is tested: with less, 
 _FEW_PIXELS = 32  # least pixels of a body that is tested
 _FEW_FRAMES = 3  # least frames of a body that is tested
 _WORLD_SHARE = 0.2  # of the picture: with more of id 0, it is the world if motions are unknown
-INTERPOLATED_PX = 0.04  # residuals of round bodies, whose depth interpolation is not exact
-_ROUND = 0.05  # of a body's flow: interpolated depth is less exact where bodies are round
 # Flow that is computed again differs by rounding: by these pixels, and by this share of its length.
 _SAME_PX = 0.02
 _SAME_SHARE = 0.01
@@ -102,18 +107,16 @@ def diagnose(
     maps = (static, before, seen.K, seen.prev_K, torch.stack(path, 1), picture)
     pairs = sampled(raw, *maps)
     reasons = reasons_untestable(pairs)
-    names = [str(index) for index in kept.tolist()]
-    testable = torch.tensor([i for i, why in enumerate(reasons) if not why], dtype=torch.long)
-    if not len(testable):
+    used = tested(reasons)
+    if not used:
         return no_diagnosis(reasons)
-    testable = testable[_spread(len(testable), _PAIRS)]
+    testable = torch.tensor(used)[_spread(len(used), _PAIRS)]
     rivals = rivals_of({}, by_flow=is_measured, of_flow=is_measured, absolute=is_absolute)
-    frozen = [name for name, why in zip(names, reasons) if why == FROZEN]
-    names = [names[i] for i in testable.tolist()]
-    result = diagnosed(pairs.select(testable), rivals, names, _adapter_call, frozen)
+    names = [str(index) for index in kept[testable].tolist()]
+    result = judged(Competition(pairs.select(testable), rivals), names, _adapter_call)
     faults, odd = _recomputed(seen, ego_key, obj_key)
-    kind, of_bodies = ("", "") if result.is_wrong else _bodies(seen, result.error_px)
-    odd += note_on_untested(reasons, sum(not why for why in reasons))
+    kind, of_bodies = ("", "") if result.is_wrong else _bodies(seen)
+    odd += note_on_untested(reasons)
     odd += [of_bodies] * (kind == "untested")
     result = replace(result, notes=(*result.notes, *odd))
     if faults := [*faults, *[of_bodies] * (kind == "fault")]:
@@ -189,7 +192,9 @@ class _Seen:
             valid = now.get(f"{raw_key}_valid", torch.ones_like(self.flow.valid))
             self.raw = torch.where(valid, self.raw.double(), math.nan)
             expected = torch.where(self.flow.valid, self.flow.flow, math.nan)
-            self.is_derived = not median(length((self.raw - expected).flatten(2))) > 0.01
+            apart, size = (length(x.flatten(2)) for x in (self.raw - expected, expected))
+            differs = (apart > _SAME_PX + _SAME_SHARE * size)[apart.isfinite()]
+            self.is_derived = not differs.double().mean() > 0.5
 
     def flow_of(self, motion: Tensor) -> geometry.Flow:
         """Returns the flow of a static world."""
@@ -228,11 +233,10 @@ def _recomputed(seen: _Seen, ego_key: str, obj_key: str) -> tuple[list[str], lis
     return faults, odd
 
 
-def _bodies(seen: _Seen, error_px: float) -> tuple[str, str]:
+def _bodies(seen: _Seen) -> tuple[str, str]:
     """Returns "fault", "untested" or "" of bodies' ids and motions, and the reason.
 
-    Each body of each frame is judged as the camera is: by the residuals of its motion on the body's
-    pixels, with the depth of the previous frame as reference, and by those of the best motion.
+    Each body of each frame is judged as the camera is, by its pixels and the depth before.
     """
     count, ids = seen.rows.shape[1], seen.ids[:, 0]
     unseen = "no moving body is seen: ids and motions of bodies are not tested"
@@ -272,26 +276,22 @@ def _bodies(seen: _Seen, error_px: float) -> tuple[str, str]:
     testable = (torch.maximum(moved_px, residual_px) >= _MOVED_PX) & (number >= _FEW_PIXELS)
     if int(testable.sum()) < _FEW_FRAMES:
         return "untested", unseen
-    pairs, body, still = pairs.select(testable), body[testable], still[testable]
-    residual_px, moved_px = residual_px[testable], moved_px[testable]
-    noise = torch.full_like(pairs.depth, INTERPOLATED_PX)
-    best = refined(pairs, torch.stack([pairs.motion, still]), noise)
-    best_px = torch.stack([_middle(residuals(pairs, each)) for each in best]).amin(0)
-    at_rest_px = _middle(residuals(pairs, still))
-    # Errors of poses are in the motions of bodies, too.
-    least = INTERPOLATED_PX + _ROUND * moved_px + error_px
-    for name, rows in (
-        ("the bodies", body > 0), *((f"body {i}", body == i) for i in body.unique().tolist())
-    ):  # fmt: skip
-        is_off = int(rows.sum()) >= _FEW_FRAMES and median((residual_px - least)[rows]) > 0
-        if is_off and median(best_px[rows]) < median(residual_px[rows]) / 2:
-            px, size, least_px = (median(x[rows]) for x in (residual_px, moved_px, best_px))
-            why = f"instance_motion or ids don't fit {name}: the residual is {px:.2g} px"
-            why += f" (flow: {size:.2g} px), and {least_px:.2g} px with the best motion"
-            return "fault", why
-    # A flat body that moves aside changes no depth: it might as well be at rest.
-    if int((at_rest_px > least).sum()) < _FEW_FRAMES:
-        return "untested", "depth hardly shows how bodies move: motions of bodies are not tested"
+    bodies = [f"body {i}" for i in body[testable].tolist()]
+    competition = Competition(pairs.select(testable), [])
+    found = judged(competition, bodies, _adapter_call)
+    if found.is_wrong:
+        return "fault", f"instance_motion or ids don't fit the bodies: {found.words}"
+    # What a motion moves off its body depends on it in jumps, which no covariance knows.
+    pairs, shown = competition.recorded.pairs, competition.recorded.shown
+    exact = pictures.mixture(pairs, pairs.motion.unsqueeze(0), competition.noise)
+    best = flow_of(pairs, pictures.best_of(shown))
+    off_px = median(length(best - flow_of(pairs, pairs.motion)).nanmedian(-1).values)
+    most_px = explanation.most_noise_px(pairs, competition.flow_px)
+    if explanation.clipped_sum(shown.nats - exact.nats) > explanation.SURE and off_px > most_px:
+        why = f"another motion, {off_px:.2g} px from theirs, fits their pixels better"
+        return "fault", f"instance_motion or ids don't fit the bodies: {why}"
+    if not found.is_right:
+        return "untested", f"motions of bodies are not tested: {found.words}"
     return "", ""
 
 

@@ -20,8 +20,8 @@ from flowrep.geometry.egomotion import structure_tensor
 from flowrep.geometry.pose import relative_motion, rotation_from_vector
 
 EYE = torch.eye(4, dtype=torch.float64)
-PIXELS = 300  # that are sampled from each pair
-_FITTED = 100  # of these: motions and numbers are fitted to fewer pixels, to save time
+PIXELS = 500  # that are sampled from each pair
+_FITTED = 250  # of these: motions and numbers are fitted to fewer pixels, to save time
 _LEAST_TEXTURE = 0.25  # of a structure tensor's trace, 0 to 2: with less, flow is a guess
 _BEHIND_PX = 1e3  # residual of a point that a motion puts behind the camera
 _STEP = 1e-6  # of numeric derivatives in float64, in radians, metres, or a change's numbers
@@ -48,6 +48,7 @@ class Pairs(NamedTuple):
     stretch: Tensor = torch.ones(
         1, 1, dtype=torch.float64
     )  # [P, N], depth's growth per that stored
+    grain: float = 0.0  # noise of inverse depth from pixel to pixel, as a share of it
     smooth: Tensor | None = None  # [P, 2, N], raw flow without noise, where a motion explains it
 
     def select(self, pairs: Any = slice(None), pixels: Any = slice(None)) -> Pairs:
@@ -58,7 +59,7 @@ class Pairs(NamedTuple):
         smooth = None if self.smooth is None else self.smooth[pairs][..., pixels]
         by = self.stretch[pairs][:, pixels] if self.stretch.numel() > 1 else self.stretch
         whole = [tensor[pairs] for tensor in self[3:8]]
-        return Pairs._make([*maps, *whole, *self[8:11], gain, bent, by, smooth])
+        return Pairs._make([*maps, *whole, *self[8:11], gain, bent, by, self.grain, smooth])
 
     @staticmethod
     def joined(parts: Sequence[Pairs]) -> Pairs:
@@ -120,15 +121,15 @@ def sampled(
         return maps.gather(-1, order.unsqueeze(1).expand(-1, maps.shape[1], -1))
 
     maps = [first(pixel.expand(count, -1, -1)), first(flow), first(depth.unsqueeze(1)).squeeze(1)]
-    inverse = [depths.double().reciprocal() for depths in (now, before)]
+    inverse, grain = [depths.double().reciprocal() for depths in (now, before)], 0.0
     if raw is None:
-        inverse[1] = _smooth(inverse[1])
+        inverse[1], grain = _smooth(inverse[1])
     whole = [K.double(), prev_K.double(), path.double(), *inverse]
     fields: Any = [*maps, *whole, raw is not None, picture is not None, float(K[:, 0, 0].median())]
-    return Pairs(*fields)
+    return Pairs(*fields)._replace(grain=grain)
 
 
-def _smooth(inverse: Tensor) -> Tensor:
+def _smooth(inverse: Tensor) -> tuple[Tensor, float]:
     """Returns inverse depth `[P, H, W]`, nan where a pixel between two others isn't their mean.
 
     There, depth that is interpolated between pixels is a guess.
@@ -138,7 +139,9 @@ def _smooth(inverse: Tensor) -> Tensor:
     bends = [around[:, 1:-1, 2:] + around[:, 1:-1, :-2], around[:, 2:, 1:-1] + around[:, :-2, 1:-1]]
     bend = torch.stack([(sides - 2 * middle).abs() / middle for sides in bends]).amax(0)
     noise = bend.flatten(1).nanmedian(-1).values[:, None, None]
-    return torch.where(bend < (5 * noise).clamp(min=_BEND), inverse, math.nan)
+    is_smooth = bend < (5 * noise).clamp(min=_BEND)
+    rough = float(bend[is_smooth].square().mean().sqrt()) / math.sqrt(6) if is_smooth.any() else 0.0
+    return torch.where(is_smooth, inverse, math.nan), rough
 
 
 def seen_before(pairs: Pairs, motion: Tensor) -> tuple[Tensor, Tensor]:
@@ -244,7 +247,7 @@ def gauss_newton(
         group: `[P]`, the row of n that is a pair's.
         noise: standard deviations `[P, N]`, px.
     """
-    k = n.shape[1]
+    k, first = n.shape[1], n
     tries = _STEP * torch.cat([torch.zeros(1, k), torch.eye(k)]).double().unsqueeze(1)
     best, least = n, torch.full((len(n),), math.inf, dtype=torch.float64)
     for step in range(steps + 1):
@@ -267,9 +270,12 @@ def gauss_newton(
             (r.nan_to_num() * weight).flatten(1),
             (J.nan_to_num() * weight.unsqueeze(-1)).flatten(1, 2),
         )
-        A = torch.zeros(len(n), k, k).double().index_add(0, group, J.mT @ J)
+        # The prior of numbers: normal, about 1 from where they started.
+        A = torch.eye(k).double() + torch.zeros(len(n), k, k).double().index_add(0, group, J.mT @ J)
         b = (
-            torch.zeros(len(n), k)
+            n
+            - first
+            + torch.zeros(len(n), k)
             .double()
             .index_add(0, group, (J.mT @ r.unsqueeze(-1)).squeeze(-1))
         )

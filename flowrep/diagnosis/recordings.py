@@ -11,15 +11,17 @@ import torch
 from torch import Tensor
 
 from flowrep.diagnosis import fit
+from flowrep.diagnosis.competition import Competition
 from flowrep.diagnosis.fit import EYE, Pairs, length, sampled
 from flowrep.diagnosis.rivals import rivals_of
-from flowrep.diagnosis.verdict import Diagnosis, diagnosed
+from flowrep.diagnosis.verdict import Diagnosis, judged
 
-# Pairs with fewer known pixels or less flow are not tested: they tell nothing.
+# Pairs with fewer known pixels tell nothing.
 _LEAST_PIXELS = 64
-_LEAST_MOVEMENT_PX = 0.25  # median length of flow
+_LEAST_MOVEMENT_PX = 0.25  # median length of flow; pairs with less are tested only if most are so
+_FEWEST = 4  # pairs that move
 _MANY_UNTESTED = 0.2  # of all pairs: a note then gives their number
-FROZEN = "the recorded camera doesn't move, but depth changes"
+_STILL = "hardly anything moves"
 
 
 @dataclass
@@ -35,8 +37,7 @@ class Examination:
     conventions: Mapping[str, str] = field(default_factory=dict)
     flow_is_recorded: bool = True
     _seen: list[tuple[Pairs, str]] = field(default_factory=list)  # name
-    _reasons: list[str] = field(default_factory=list)
-    _frozen: list[str] = field(default_factory=list)
+    _reasons: list[str] = field(default_factory=list)  # why each pair can't be tested, or ""
     _intervals_s: list[float] = field(default_factory=list)
 
     @torch.no_grad()
@@ -61,26 +62,23 @@ class Examination:
             picture = torch.as_tensor(current.rgb).movedim(-1, 0)[None]
         pairs = sampled(flow, now, before, K, prev_K, path[None], picture)
         (why,) = reasons_untestable(pairs)
-        if why:
-            self._reasons.append(why)
-            self._frozen += [current.name] * (why == FROZEN)
-            return False
         self._seen.append((pairs, current.name))
+        self._reasons.append(why)
         if previous.timestamp_s is not None and current.timestamp_s is not None:
             self._intervals_s.append(current.timestamp_s - previous.timestamp_s)
-        return True
+        return not why
 
     @torch.no_grad()
     def diagnosis(self) -> Diagnosis:
         """Returns the diagnosis of all pairs so far."""
-        if not self._seen:
+        used = tested(self._reasons)
+        if not used:
             return no_diagnosis(self._reasons)
-        parts, names = zip(*self._seen)
+        parts, names = zip(*(self._seen[i] for i in used))
         options = {"by_flow": True, "of_flow": self.flow_is_recorded, "absolute": True}
         rivals = rivals_of(self.conventions, **options)
-        pairs = Pairs.joined(parts)
-        result = diagnosed(pairs, rivals, names, self._instruction, self._frozen)
-        return replace(result, notes=(*result.notes, *note_on_untested(self._reasons, len(names))))
+        result = judged(Competition(Pairs.joined(parts), rivals), names, self._instruction)
+        return replace(result, notes=(*result.notes, *note_on_untested(self._reasons)))
 
     def _instruction(self, remedy: str, corrected: Pairs) -> str:
         words, given = remedy.split(" "), self.conventions
@@ -101,46 +99,37 @@ class Examination:
 
 
 def reasons_untestable(pairs: Pairs) -> list[str]:
-    """Returns why each pair can't be tested, "" if it can, `FROZEN` if its depth shows movement."""
+    """Returns why each pair can't be tested, "" if it can."""
     ego = length(fit.flow_of(pairs, pairs.motion)).nanmedian(-1).values.nan_to_num(0.0)
-    raw = length(pairs.raw).nanmedian(-1).values.nan_to_num(0.0)
-    moves = torch.maximum(raw, ego) >= _LEAST_MOVEMENT_PX
+    # While a camera stands still, neither flow nor depth changes.
+    still = fit.EYE.expand(len(pairs.K), 4, 4)
+    seen = length(fit.residuals(pairs, still)).nanmedian(-1).values.nan_to_num(0.0)
+    moves = torch.maximum(seen, ego) >= _LEAST_MOVEMENT_PX
     number, has_depth = (~pairs.depth.isnan()).sum(-1), pairs.now.isfinite().flatten(1).any(1)
-    is_known = has_depth & (number >= _LEAST_PIXELS)
-    # While a camera stands still, depth doesn't change.
-    still, frozen = (is_known & ~moves).nonzero()[:, 0], torch.zeros_like(moves)
-    if len(still) and pairs.has_poses:
-        few = pairs.select(still)._replace(by_flow=False)
-        before = fit.residuals(few, few.motion)
-        noise = torch.full_like(few.depth, _LEAST_MOVEMENT_PX)
-        after = fit.residuals(few, fit.refined(few, few.motion.unsqueeze(0), noise)[0])
-        now, then = (length(x).nanmedian(-1).values for x in (before, after))
-        frozen[still] = (now > 2 * _LEAST_MOVEMENT_PX) & (then < now / 3)
-    return [_reason(*each) for each in zip(*map(Tensor.tolist, (has_depth, number, moves, frozen)))]
+    return [
+        "depth is nowhere known" if not is_known
+        else "too few pixels are known" if count < _LEAST_PIXELS
+        else "" if is_moving else _STILL
+        for is_known, count, is_moving in zip(*map(Tensor.tolist, (has_depth, number, moves)))
+    ]  # fmt: skip
 
 
-def _reason(has_depth: bool, number: int, moves: bool, is_frozen: bool) -> str:
-    if not has_depth:
-        return "depth is nowhere known"
-    if number < _LEAST_PIXELS:
-        return "too few pixels are known"
-    if moves:
-        return ""
-    return FROZEN if is_frozen else "hardly anything moves"
+def tested(reasons: Sequence[str]) -> list[int]:
+    """Returns the pairs to test: those that move, and those at rest if few do."""
+    moving = [i for i, why in enumerate(reasons) if not why]
+    known = [i for i, why in enumerate(reasons) if why in ("", _STILL)]
+    return moving if len(moving) >= _FEWEST else known
 
 
-def note_on_untested(reasons: Sequence[str], used: int) -> list[str]:
-    """Returns a note on pairs that can't be tested, if they are many; "" is no reason."""
-    reasons = [why for why in reasons if why not in ("", FROZEN)]
-    count = len(reasons) + used
-    if len(reasons) < _MANY_UNTESTED * count:
+def note_on_untested(reasons: Sequence[str]) -> list[str]:
+    """Returns a note on pairs that tell little, if they are many."""
+    few = [why for why in reasons if why]
+    if len(few) < _MANY_UNTESTED * len(reasons):
         return []
-    return [f"{len(reasons)} of {count} pairs are not tested: {max(reasons, key=reasons.count)}"]
+    return [f"{len(few)} of {len(reasons)} pairs tell little: {max(few, key=few.count)}"]
 
 
 def no_diagnosis(reasons: Sequence[str]) -> Diagnosis:
     """Returns the diagnosis if no pair can be tested."""
     why = max(reasons, key=reasons.count) if reasons else "there are no two successive frames"
-    if why == FROZEN:
-        return Diagnosis("something is wrong", why)
     return Diagnosis("can't tell", f"{why}; record frames in which the camera moves and turns")

@@ -25,6 +25,8 @@ from flowrep.diagnosis.fit import (
 )  # fmt: skip
 
 Change = Callable[[Pairs, Tensor], Pairs]  # of pairs, with numbers [P, k]
+# Half turns, near which no fit that starts at none gets.
+_TURNS = tuple(tuple(3.0 * (i == j) for j in range(6)) for i in range(-1, 3))
 # A fitted factor beyond these, or below their inverse, is no camera's and no unit's.
 _LARGEST_FACTORS = {"camera": 30.0, "depth": 1e5}
 
@@ -64,6 +66,11 @@ class Rival(NamedTuple):
         """Whether it interpolates poses, which makes their noise smaller."""
         return self.change is _later
 
+    @property
+    def reverses(self) -> bool:
+        """Whether it looks at pairs of frames from the earlier one."""
+        return self.change in (_late_depth, _of_previous)
+
     def texts(self, numbers: Tensor, width: int) -> tuple[str, str]:
         """Returns the remedy and the description, with the numbers that were fitted."""
         n, values = [*numbers.tolist(), 0.0, 0.0], {}
@@ -71,9 +78,9 @@ class Rival(NamedTuple):
         values["far"] = f"{1 / max(n[0] + n[1], 1e-6):.3g}"
         if len(numbers) >= 2:  # the last two of some are shares of the width
             values["px"] = f"({width * n[-4]:+.1f}, {width * n[-3]:+.1f}) px"
-        if len(numbers) == 6:
+        if len(numbers) in (3, 6):
             values["degrees"] = f"{math.degrees(math.hypot(*n[:3])):.1f}"
-            rows = small_motion(numbers)[:3].flatten().tolist()
+            rows = small_motion(torch.cat([numbers, 0 * numbers])[:6])[:3].flatten().tolist()
             values["matrix"] = f"[{','.join(f'{x:.4g}' for x in rows)}]"
         return self.remedy.format(*n, **values), self.description.format(*n, **values)
 
@@ -115,10 +122,11 @@ def rivals_of(
         Rival("poses", "poses {0:.2f} frames later", "the times of poses are {0:.2f} frames late",
               _later, ((0.0,),), (0.5,)),
         Rival("poses", "marker_from_cam={matrix}",
+              "the camera is turned on its mount, {degrees} degrees", _on_a_mount,
+              tuple(turn[:3] for turn in _TURNS), (0.1,) * 3),
+        Rival("poses", "marker_from_cam={matrix}",
               "poses are a marker's or by angles in another order, {degrees} degrees off",
-              lambda p, n: p._replace(path=p.path @ small_motion(n)[:, None]),
-              ((0.0,) * 6, (3.0, *[0.0] * 5), (0.0, 3.0, *[0.0] * 4), (0.0, 0.0, 3.0, *[0.0] * 3)),
-              (0.1,) * 6),
+              _on_a_mount, _TURNS, (0.1,) * 6),
         Rival("camera", "K's numbers in another order", "K's numbers are fx, cx, fy, cy",
               _camera(lambda fx, cx, fy, cy, w, h, n: (fx, fy, cx, cy))),
         Rival("camera", "K in pixels", "K is in widths and heights",
@@ -127,7 +135,7 @@ def rivals_of(
               _camera(lambda *k: [k[-1][0] * x for x in k[:4]]), ((1.0,), (0.4,), (2.5,)), (1.25,)),
         Rival("camera", "cx and cy moved by {px}", "the pictures were cropped, K was not",
               _camera(lambda fx, cx, fy, cy, w, h, n: (fx, cx + w * n[0], fy, cy + w * n[1])),
-              ((0.0, 0.0),), (0.1, 0.1)),
+              ((0.0, 0.0), (0.5, 0.5)), (0.1, 0.1)),
         Rival("camera", "fx times {0:.3g}, fy times {1:.3g}, cx and cy moved by {px}",
               "K is another camera's", _camera(lambda fx, cx, fy, cy, w, h, n: (
                   fx * n[0].clamp(0.01), cx + w * n[2], fy * n[1].clamp(0.01), cy + w * n[3])),
@@ -237,6 +245,11 @@ def _rolled(places: int, path: Tensor) -> Tensor:
     pose = torch.cat([path[..., :3, 3].nan_to_num(), xyzw], -1)
     pose = geometry.pose_from_quaternion(pose, "xyz_xyzw", check=False)
     return torch.where(known, pose, math.nan)
+
+
+def _on_a_mount(pairs: Pairs, n: Tensor) -> Pairs:
+    """Turns, and with six numbers moves, the camera on what the poses are of."""
+    return pairs._replace(path=pairs.path @ small_motion(torch.cat([n, 0 * n], -1)[:, :6])[:, None])
 
 
 def _later(pairs: Pairs, share: Tensor) -> Pairs:

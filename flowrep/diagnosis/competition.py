@@ -1,0 +1,201 @@
+"""The explanations of some pairs of frames, of which the likeliest is the diagnosis."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from flowrep.diagnosis import explanation, fit, pictures
+from flowrep.diagnosis.explanation import Explanation
+from flowrep.diagnosis.fit import EYE, Pairs, flow_of, length, median, residuals
+from flowrep.diagnosis.pictures import Mixture, Noise
+from flowrep.diagnosis.rivals import Rival, fitted_numbers
+from flowrep.geometry.egomotion import motion_of_points
+
+_SCORED = 9  # corrections of the data that compete in full, those that fit best with exact poses
+NO_RIVAL = Rival("poses", "", "", lambda pairs, n: pairs)
+OF_NOISE = Rival("flow", "", "", lambda pairs, n: pairs._replace(gain=1e-3 * pairs.gain))
+
+
+class Competition:
+    """Explains pairs, with one noise for all explanations: the least that any of them leaves.
+
+    Attributes:
+        rivals: those that the data let compete.
+        recorded: the data as recorded.
+        others: each rival's.
+        of_noise: that raw flow is noise, if there are rivals that change raw flow.
+        flow_px: the median length of flow.
+        rule_px: the errors of poses that a rule predicts, see `explanation.by_a_rule`.
+        rule_nats: what speaks for the rule.
+    """
+
+    def __init__(self, pairs: Pairs, rivals: Sequence[Rival]) -> None:
+        if not pairs.by_flow and pairs.has_poses:
+            # What the recorded motion takes out of the picture is no evidence against it.
+            known = ~pairs.depth.isnan()
+            seen = residuals(pairs, pairs.motion)[:, 0].isfinite()
+            is_most = seen.sum(-1, keepdim=True) > 0.5 * known.sum(-1, keepdim=True)
+            pairs = pairs._replace(depth=pairs.depth.masked_fill(~seen & is_most, math.nan))
+        none, self._has_poses = pairs.depth[:, :0], pairs.has_poses
+        rivals = [r for r in rivals if pairs.has_poses or r.subject != "poses"]
+        self.rivals = rivals
+        without = [r for r in rivals if r.subject == "poses" and not r.start[0]]
+        starts = _starts(pairs, [rival.change(pairs, none).motion for rival in without])
+        noise = _noise(pairs, starts)
+        starts = fit.refined(pairs, starts, noise.px)
+        noise = _noise(pairs, starts)
+        shown = pictures.mixture(pairs, starts, noise)
+        noise = pictures.learnt_noise(pairs, _left(pairs, starts, shown))
+        best = flow_of(pairs, pictures.best_of(shown))
+        self.flow_px = median(length(pairs.raw if pairs.by_flow else best).nanmedian(-1).values)
+        pairs = pairs._replace(smooth=_smooth(pairs, shown))
+        own = pairs.motion if pairs.has_poses else pictures.best_of(shown)
+        tried = []
+        for rival in rivals:
+            fitted = fitted_numbers(pairs, rival, torch.where(own.isfinite(), own, EYE), noise.px)
+            if fitted is not None:
+                tried.append((rival, *fitted))
+        data = sorted((t for t in tried if t[0].subject != "poses"), key=lambda t: t[2])
+        # Without poses, the motion that a correction makes fit isn't known yet: all compete.
+        data = data[:_SCORED] if pairs.has_poses else data
+        changes: list[tuple[Any, ...]] = [(NO_RIVAL, none, pairs)]
+        if any(rival.subject == "flow" for rival, *_ in data):
+            changes.append((OF_NOISE, none, OF_NOISE.change(pairs, none)))
+        changes += [(rival, n, rival.change(pairs, n)) for rival, n, _ in data]
+        begun = [_motions(changed, shown, noise) for *_, changed in changes]
+        # Motions that any of them finds are tried on the data of all, also on those as recorded.
+        pool = torch.cat([starts, *begun])
+        motions = [
+            torch.cat([own, fit.refined(changed, _nearest(changed, pool), noise.px, 4)])
+            for own, (*_, changed) in zip(begun, changes)
+        ]
+        noises = [_noise(changed, each) for each, (*_, changed) in zip(motions, changes)]
+        self.noise = noise = min(noises, key=lambda each: float(each.px.log().mean()))
+        least_px = 1e-3 if pairs.by_flow else 1e-2
+        self._limits = (
+            self.flow_px,
+            least_px,
+            max(explanation.most_noise_px(pairs, self.flow_px), 2 * least_px),
+        )
+        found = []
+        for (rival, n, changed), each in zip(changes, motions):
+            shown = pictures.mixture(changed, each, noise)
+            found.append(
+                self._explained(rival, n, changed, shown, pictures.metric(changed, shown, noise))
+            )
+        self.recorded, *self.others = found
+        self.of_noise = (
+            self.others.pop(0) if len(changes) > 1 and changes[1][0] is OF_NOISE else None
+        )
+        self.others += [
+            self._of_poses(rival, n) for rival, n, _ in tried if rival.subject == "poses"
+        ]
+        self.rule_px = self.rule_nats = 0.0
+        if self.recorded.poses is not None and len(pairs.K) >= 8:
+            rule = explanation.by_a_rule(self.recorded)
+            after = explanation.poses(
+                pairs.motion, self.recorded.shown, self.recorded.metric, *self._limits, rule
+            )
+            self.rule_px = median(rule.norm(dim=-1))
+            self.rule_nats = explanation.clipped_sum(after.nats - self.recorded.poses.nats)
+
+    def is_seen(self, other: Explanation) -> bool:
+        """Whether a change of raw flow explains it better than that it is noise."""
+        if other.rival.subject != "flow" or self.of_noise is None:
+            return True
+        return other.nats - self.of_noise.nats > explanation.SURE
+
+    def _of_poses(self, rival: Rival, n: Tensor) -> Explanation:
+        """Returns a rival that changes poses alone: pictures show what they do as recorded."""
+        pairs, shown, metric = self.recorded.pairs, self.recorded.shown, self.recorded.metric
+        found = self._explained(rival, n, rival.change(pairs, n), shown, metric)
+        if rival.is_of_time:
+            # Poses between two recorded ones have less noise: only what the opposite time doesn't
+            # gain speaks for a delay.
+            n = -found.n.expand(len(pairs.K), -1)
+            back = self._explained(rival, n, rival.change(pairs, n), shown, metric)
+            found = replace(found, handicap=max(back.nats - self.recorded.nats, 0.0))
+        return found
+
+    def _explained(
+        self, rival: Rival, n: Tensor, pairs: Pairs, shown: Mixture, metric: Any
+    ) -> Explanation:
+        of = (
+            explanation.poses(pairs.motion, shown, metric, *self._limits)
+            if self._has_poses
+            else None
+        )
+        return Explanation(rival, n.nanmedian(0).values, pairs, shown, metric, of)
+
+
+def _starts(pairs: Pairs, closed: Sequence[Tensor]) -> Tensor:
+    """Returns motions `[M, P, 4, 4]` that pictures may show, as a start for fits."""
+    still = EYE.expand(len(pairs.K), 4, 4)
+    known = [pairs.motion, *closed, still] if pairs.has_poses else [still]
+    known = [torch.where(each.isfinite(), each, EYE) for each in known]
+    size = length(residuals(pairs.few, torch.stack(known)))
+    rank = size.nanquantile(0.4, -1).nan_to_num(math.inf).argmin(0)
+    starts = [torch.stack(known)[rank, torch.arange(len(still))], known[0], still]
+    left = torch.ones_like(pairs.depth, dtype=torch.bool)
+    for _ in range(2 * pairs.by_flow):
+        starts.append(motion_of_points(*_points(pairs), left))
+        size = length(residuals(pairs, starts[-1]))
+        left = left & ~(size < 3 * size.nanquantile(0.2, -1, keepdim=True))
+    return torch.stack(starts)
+
+
+def _motions(pairs: Pairs, shown: Mixture, noise: Noise) -> Tensor:
+    """Returns motions that changed pictures show: those next to known ones, and a body's."""
+    motion = pairs.motion
+    if not pairs.has_poses:
+        motion = motion_of_points(*_points(pairs), torch.ones_like(pairs.depth) > 0)
+    found = fit.refined(pairs, torch.stack([motion, pictures.best_of(shown)]), noise.px, 4)
+    number = shown.motions[..., 0, 0].isfinite().sum(0)
+    if not pairs.by_flow or (number > 1).double().mean() <= 0.5:
+        return found
+    size = length(residuals(pairs, found)).nan_to_num(math.inf)
+    near = size.nanquantile(0.2, -1, keepdim=True).argmin(0, keepdim=True)
+    left = size.gather(0, near.expand(1, *size.shape[1:]))[0] > 5 * noise.px
+    other = motion_of_points(*_points(pairs), left).unsqueeze(0)
+    return torch.cat([found, fit.refined(pairs, other, noise.px, 4)])
+
+
+def _nearest(pairs: Pairs, pool: Tensor) -> Tensor:
+    """Returns the two motions of a pool that leave least of many pixels, for each pair."""
+    size = length(residuals(pairs.few, pool)).nanquantile(0.3, -1).nan_to_num(math.inf)
+    return pool[size.argsort(0)[:2], torch.arange(pool.shape[1])]
+
+
+def _left(pairs: Pairs, motions: Tensor, shown: Mixture) -> Tensor:
+    """Returns the residuals `[P, C, N]` of each pixel's likeliest motion, nan of outliers."""
+    rest, likely = residuals(pairs, motions), shown.odds.max(0)
+    rest = rest.gather(0, likely.indices[None, :, None].expand(1, -1, rest.shape[2], -1))[0]
+    return torch.where(likely.values.unsqueeze(1) > 0.3, rest, math.nan)
+
+
+def _noise(pairs: Pairs, motions: Tensor) -> Noise:
+    """Returns the noise of the motion that leaves least of many pixels."""
+    rest = residuals(pairs, motions)
+    near = length(rest).nanquantile(pictures.near_share(pairs), -1).nan_to_num(math.inf).argmin(0)
+    return pictures.learnt_noise(pairs, rest[near, torch.arange(len(near))])
+
+
+def _smooth(pairs: Pairs, shown: Mixture) -> Tensor:
+    """Returns raw flow without its noise, where a motion explains it."""
+    flow = flow_of(pairs, torch.where(shown.motions.isfinite(), shown.motions, EYE))
+    likely = shown.odds.max(0)
+    flow = flow.gather(0, likely.indices[None, :, None].expand(1, -1, 2, -1))[0]
+    return torch.where(likely.values.unsqueeze(1) > 0.5, flow, pairs.shift)
+
+
+def _points(pairs: Pairs) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Returns rays [P, 3, N], inverse depth, the flow that K's change doesn't cause, and K."""
+    rays = torch.linalg.inv_ex(pairs.K)[0] @ fit.homogeneous(pairs.pixel)
+    moved = (pairs.prev_K @ rays)[:, :2] - (pairs.pixel - torch.linalg.solve(pairs.gain, pairs.raw))
+    return rays, pairs.depth.reciprocal(), moved, pairs.prev_K
