@@ -362,16 +362,16 @@ TWO = {"depth in mm along the ray": ("depth times", "ray_length")}
 OF_PICTURES = (
     "lens distortion",
     "K that changes",
-)  # that an env, which computes its flow, can't have
+)  # that flow which flowrep computes or estimates can't have
 
 
 def drawn(right: Shots, seed: int) -> tuple[str, tuple[str, ...], Shots]:
     """Returns the name of a mistake, how it may be named, and shots with it."""
     r = np.random.default_rng([71, seed])
     names = [name for name in [*LISTED, *UNLISTED]
-             if not (right.is_env and ("flow" in name or name in OF_PICTURES))
-             and not (name.startswith("bodies") and not (right.is_env and (right.ids[1:] > 0).any()))
-             and not (right.rgb is not None and name in OF_PICTURES)]  # fmt: skip
+             if not ((right.is_env or right.rgb is not None) and ("flow" in name or name in OF_PICTURES))
+             and not (name.startswith("bodies") and not (right.is_env and (right.ids[1:] > 0).any()))]  # fmt: skip
     name = str(r.choice(names))
     mistake, wanted = LISTED[name] if name in LISTED else (UNLISTED[name], TWO.get(name, ()))
+
     return name, wanted, mistake(right, r)

@@ -318,11 +318,11 @@ def draw(seed: int, *, route: str | None = None, moving: float | None = None) ->
 
 
 @cache
-def estimator() -> Any:
+def estimator(preset: str) -> Any:
     from flowrep.sequences import EstimatedFlowSource
     from flowrep.transforms import DIS
 
-    return EstimatedFlowSource(DIS("fast"))
+    return EstimatedFlowSource(DIS(preset))
 
 
 def frames_of(shots: Shots, *, has_flow: bool = True) -> list[Any]:
@@ -338,7 +338,8 @@ def frames_of(shots: Shots, *, has_flow: bool = True) -> list[Any]:
 
 
 def estimated_flow(shots: Shots) -> Array:
-    """Returns DIS's flow of the pictures."""
+    """Returns DIS's flow of the pictures, with the preset that its documentation gives the size."""
+    estimate = estimator("fine" if shots.depth.shape[-1] < 320 else "fast")
     first = np.full((2, *shots.depth.shape[1:]), np.nan, np.float32)
     pairs = pairwise(frames_of(shots, has_flow=False))
-    return np.array([first, *(estimator()(*both) for both in pairs)])
+    return np.array([first, *(estimate(*both) for both in pairs)])
