@@ -86,6 +86,8 @@ class Competition:
         found = []
         for (rival, n, changed), each in zip(changes, motions):
             shown = pictures.mixture(changed, each, noise)
+            if rival is NO_RIVAL and pairs.by_flow and pairs.has_poses:
+                shown = pictures.either(shown, _beside_bodies(pairs, noise))
             found.append(
                 self._explained(rival, n, changed, shown, pictures.metric(changed, shown, noise))
             )
@@ -164,6 +166,15 @@ def _motions(pairs: Pairs, shown: Mixture, noise: Noise) -> Tensor:
     left = size.gather(0, near.expand(1, *size.shape[1:]))[0] > 5 * noise.px
     other = motion_of_points(*_points(pairs), left).unsqueeze(0)
     return torch.cat([found, fit.refined(pairs, other, noise.px, 4)])
+
+
+def _beside_bodies(pairs: Pairs, noise: Noise) -> Mixture:
+    """Returns the recorded motions beside others: bodies pull fits of the world to them."""
+    motion = torch.where(pairs.motion.isfinite(), pairs.motion, EYE)
+    left = length(residuals(pairs, motion)) > 2 * noise.px
+    other = motion_of_points(*_points(pairs), left).unsqueeze(0)
+    other = fit.refined(pairs, other, noise.px, 4)
+    return pictures.mixture(pairs, torch.cat([motion.unsqueeze(0), other]), noise)
 
 
 def _nearest(pairs: Pairs, pool: Tensor) -> Tensor:

@@ -152,6 +152,14 @@ def mixture(pairs: Pairs, motions: Tensor, noise: Noise) -> Mixture:
     return Mixture(needed, best[0], best[1], best[2], log_odds)
 
 
+def either(one: Mixture, other: Mixture) -> Mixture:
+    """Returns the motions of both mixtures, of which a picture shows the one or the other."""
+    nats = one.nats.maximum(other.nats)
+    fields = [torch.cat(both) for both in zip(one[:3], other[:3])]
+    log_odds = torch.cat([each.log_odds + each.nats - nats for each in (one, other)])
+    return Mixture(fields[0], fields[1], fields[2], nats, log_odds)
+
+
 def best_of(shown: Mixture) -> Tensor:
     """Returns the likeliest motion, [P, 4, 4]."""
     return shown.motions[shown.log_odds.argmax(0), torch.arange(shown.shares.shape[1])]

@@ -106,6 +106,8 @@ def judged(
 
     most_px = max(most_noise_px(pairs, flow_px), harmless_px)
     least_px = most_px if flow_px < _REST_PX else max(harmless_px, bias_px)
+    if recorded.poses is not None:  # what pictures don't show can't be told from a mistake
+        least_px = max(least_px, recorded.systematic_px()[1])
     if alike := _likeliest(found, effects, least_px, unsure_px + bias_px):
         width = pairs.now.shape[-1]
         texts = [each.rival.texts(each.n, width) for each in alike]
