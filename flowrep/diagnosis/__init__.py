@@ -2,10 +2,11 @@
 
 A camera motion predicts where each pixel was in the previous frame. The prediction is compared with
 a reference: raw flow if it was measured or estimated, else the depth of the previous frame. The
-motion with the smallest residuals shows how well the data can agree. If the residuals of the
-recorded motion are larger, a convention is wrong, whether the table of usual mistakes (the rivals)
-lists it or not. The rivals are then tried as explanations. Numbers that a rival needs (a factor, a
-transform) are fitted to one half of the pairs of frames and judged by the other.
+data as recorded compete with the same data after each usual mistake is undone, by one likelihood.
+
+`recordings` and `envs` make pairs of frames (`fit`). `rivals` lists the mistakes, `pictures` says
+what pairs show, `explanation` how well recorded motions fit that, `competition` which explanations
+there are, and `verdict` what follows.
 """
 
 from flowrep.diagnosis.envs import diagnose

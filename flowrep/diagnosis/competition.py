@@ -30,6 +30,7 @@ class Competition:
         recorded: the data as recorded.
         others: each rival's.
         of_noise: that raw flow is noise, if there are rivals that change raw flow.
+        noise: that of all explanations.
         flow_px: the median length of flow.
         rule_px: the errors of poses that a rule predicts, see `explanation.by_a_rule`.
         rule_nats: what speaks for the rule.
@@ -53,7 +54,7 @@ class Competition:
         shown = pictures.mixture(pairs, starts, noise)
         noise = pictures.learnt_noise(pairs, _left(pairs, starts, shown))
         best = flow_of(pairs, pictures.best_of(shown))
-        self.flow_px = median(length(pairs.raw if pairs.by_flow else best).nanmedian(-1).values)
+        self.flow_px = median(fit.middle(pairs.raw if pairs.by_flow else best))
         pairs = pairs._replace(smooth=_smooth(pairs, shown))
         own = pairs.motion if pairs.has_poses else pictures.best_of(shown)
         tried = []

@@ -20,6 +20,7 @@ from flowrep.diagnosis.fit import (
     flow_of,
     length,
     median,
+    middle,
     residuals,
     sampled,
     seen_before,
@@ -271,7 +272,7 @@ def _bodies(seen: _Seen) -> tuple[str, str]:
     still = seen.motion[frame]
     at, at_rest = (seen_before(pairs, motion)[0] for motion in (pairs.motion, still))
     residuals_px = residuals(pairs, pairs.motion)
-    moved_px, residual_px = _middle(at - at_rest), _middle(residuals_px)
+    moved_px, residual_px = middle(at - at_rest), middle(residuals_px)
     number = residuals_px.isfinite().sum((1, 2))
     testable = (torch.maximum(moved_px, residual_px) >= _MOVED_PX) & (number >= _FEW_PIXELS)
     if int(testable.sum()) < _FEW_FRAMES:
@@ -285,7 +286,7 @@ def _bodies(seen: _Seen) -> tuple[str, str]:
     pairs, shown = competition.recorded.pairs, competition.recorded.shown
     exact = pictures.mixture(pairs, pairs.motion.unsqueeze(0), competition.noise)
     best = flow_of(pairs, pictures.best_of(shown))
-    off_px = median(length(best - flow_of(pairs, pairs.motion)).nanmedian(-1).values)
+    off_px = median(middle(best - flow_of(pairs, pairs.motion)))
     most_px = explanation.most_noise_px(pairs, competition.flow_px)
     if explanation.clipped_sum(shown.nats - exact.nats) > explanation.SURE and off_px > most_px:
         why = f"another motion, {off_px:.2g} px from theirs, fits their pixels better"
@@ -293,10 +294,6 @@ def _bodies(seen: _Seen) -> tuple[str, str]:
     if not found.is_right:
         return "untested", f"motions of bodies are not tested: {found.words}"
     return "", ""
-
-
-def _middle(vectors: Tensor) -> Tensor:
-    return length(vectors).nanmedian(-1).values
 
 
 def _adapter_call(remedy: str, _: Pairs) -> str:

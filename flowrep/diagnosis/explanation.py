@@ -20,7 +20,9 @@ from flowrep.diagnosis.fit import EYE, Pairs, flow_of, length, median, motion_ve
 from flowrep.diagnosis.pictures import Metric, Mixture, best_of
 from flowrep.diagnosis.rivals import Rival
 
-SURE = 25.0  # nats: the odds of a hundred thousand to one that one in fifty rivals has to have
+# Nats that an explanation has to be better by: 15 are the odds of a hundred thousand to one for one
+# of fifty rivals; noise that pixels share doubles what chance gives.
+SURE = 25.0
 _MOST_NATS = 10.0  # that a pair counts for or against an explanation, of few pairs more
 _RATES = (0.02, 0.3)  # shares of pairs whose poses are bad
 
@@ -31,7 +33,8 @@ class Poses(NamedTuple):
     Its length is the root mean square of the flow that it causes over the motion's pixels. `cov`
     `[P, 6, 6]` is that of the picture's motion, `noise_px` the learnt noise of rotation and of
     translation, `noise` `[P, 6, 6]` both, `nats` `[P]` the log-likelihood, nan where a motion is
-    unknown, `is_bad` whether a pair's pose is no noisy one, `mode` the motion that it belongs to.
+    unknown, `is_bad` whether a pair's pose is off by more than noise, `mode` the motion of the
+    picture that it is compared with, and `root` that motion's, see `Metric`.
     """
 
     y: Tensor
@@ -156,8 +159,8 @@ class Explanation:
         """Returns the error that all recorded motions share, and twice its standard deviation."""
         found, pair = self.poses, torch.arange(len(self.shown.nats))
         assert found is not None
-        known = self.metric.known[found.mode, pair]
-        W = known @ torch.linalg.inv_ex(torch.eye(6) + found.noise @ known)[0]
+        information = self.metric.information[found.mode, pair]
+        W = information @ torch.linalg.inv_ex(torch.eye(6) + found.noise @ information)[0]
         used = found.nats.isfinite()
         used = used & ~found.is_bad if (used & ~found.is_bad).any() else used
         most_px = self.metric.most_px[found.mode, pair][used].median()

@@ -38,7 +38,7 @@ class Pairs(NamedTuple):
     K: Tensor  # [P, 3, 3]
     prev_K: Tensor
     path: Tensor  # [P, 4, 4, 4], world_from_cam at t - 2 to t + 1
-    now: Tensor  # [P, H, W], inverse depth of the current frame
+    now: Tensor  # [P, H, W], inverse depth of the current frame, 1 / m
     before: Tensor  # the same of the previous one
     by_flow: bool  # whether the reference is raw flow, not the depth of the previous frame
     is_estimated: bool  # whether flow was estimated from pictures
@@ -206,6 +206,11 @@ def length(vectors: Tensor) -> Tensor:
     return vectors.square().sum(-2).sqrt()
 
 
+def middle(vectors: Tensor) -> Tensor:
+    """Returns the median length of vectors `[..., C, N]`, nan if none is known."""
+    return length(vectors).nanmedian(-1).values
+
+
 def median(values: Tensor) -> float:
     """Returns the median of known values, inf if most are not."""
     unknown = int(values.isnan().sum())
@@ -238,8 +243,8 @@ def gauss_newton(
 ) -> tuple[Tensor, Tensor]:
     """Returns numbers `[G, k]` with smaller residuals, and their costs `[G]`.
 
-    Residuals r have the cost log(1 + r² / s²), and weights as Geman and McClure's. The scale s is
-    that of the nearest pixels, and at last that of the noise.
+    Residuals r have the cost log(1 + r² / noise²), and weights as Geman and McClure's, whose scale
+    is that of the nearest pixels, and at last at most three times the noise.
 
     Args:
         residuals_of: gives residuals `[..., P, C, N]` of each pair's numbers `[..., P, k]`.

@@ -168,13 +168,13 @@ def best_of(shown: Mixture) -> Tensor:
 class Metric(NamedTuple):
     """Of a mixture's motions: `root` `[M, P, 6, 6]` makes px of a small motion.
 
-    `known` `[M, P, 6, 6]` is the information that pixels have of it, 1 / px², `cov` the covariance
-    with the prior: nothing is off by more than `most_px` `[M, P]`.
+    `information` `[M, P, 6, 6]` is what pixels have of it, 1 / px², `cov` the covariance with the
+    prior: nothing is off by more than `most_px` `[M, P]`.
     """
 
     root: Tensor
     cov: Tensor
-    known: Tensor
+    information: Tensor
     most_px: Tensor
 
 
@@ -201,11 +201,11 @@ def metric(pairs: Pairs, shown: Mixture, noise: Noise) -> Metric:
     weight = weight * odds / px.square() / noise.together * pairs.depth.shape[-1] / number
     J = pairs.gain @ J if pairs.by_flow else jacobian(rest)
     back = torch.linalg.inv_ex(root)[0]
-    known = back.mT @ torch.einsum("impcn,jmpcn,mpn->mpij", J, J, weight) @ back
+    information = back.mT @ torch.einsum("impcn,jmpcn,mpn->mpij", J, J, weight) @ back
     length_px = length(flow[0]).nan_to_num(0.0)
     most_px = 2 * (length_px * odds).sum(-1) / total + 1
-    cov = torch.linalg.inv_ex(known + torch.eye(6) / most_px.square()[..., None, None])[0]
+    cov = torch.linalg.inv_ex(information + torch.eye(6) / most_px.square()[..., None, None])[0]
     if pairs.is_estimated:  # its errors are smooth: a motion shares them
         bias_px = _ESTIMATED[0] + _ESTIMATED[1] * length_px.median(-1).values
         cov = cov + bias_px.square()[..., None, None] / 6 * torch.eye(6)
-    return Metric(root, cov, known, most_px)
+    return Metric(root, cov, information, most_px)

@@ -12,13 +12,13 @@ from torch import Tensor
 
 from flowrep.diagnosis import fit
 from flowrep.diagnosis.competition import Competition
-from flowrep.diagnosis.fit import EYE, Pairs, length, sampled
+from flowrep.diagnosis.fit import EYE, Pairs, sampled
 from flowrep.diagnosis.rivals import rivals_of
 from flowrep.diagnosis.verdict import Diagnosis, judged
 
 # Pairs with fewer known pixels tell nothing.
 _LEAST_PIXELS = 64
-_LEAST_MOVEMENT_PX = 0.25  # median length of flow; pairs with less are tested only if most are so
+_LEAST_MOVEMENT_PX = 0.25  # median length of flow; pairs with less are tested if few have more
 _FEWEST = 4  # pairs that move
 _MANY_UNTESTED = 0.2  # of all pairs: a note then gives their number
 _STILL = "hardly anything moves"
@@ -100,10 +100,10 @@ class Examination:
 
 def reasons_untestable(pairs: Pairs) -> list[str]:
     """Returns why each pair can't be tested, "" if it can."""
-    ego = length(fit.flow_of(pairs, pairs.motion)).nanmedian(-1).values.nan_to_num(0.0)
+    ego = fit.middle(fit.flow_of(pairs, pairs.motion)).nan_to_num(0.0)
     # While a camera stands still, neither flow nor depth changes.
     still = fit.EYE.expand(len(pairs.K), 4, 4)
-    seen = length(fit.residuals(pairs, still)).nanmedian(-1).values.nan_to_num(0.0)
+    seen = fit.middle(fit.residuals(pairs, still)).nan_to_num(0.0)
     moves = torch.maximum(seen, ego) >= _LEAST_MOVEMENT_PX
     number, has_depth = (~pairs.depth.isnan()).sum(-1), pairs.now.isfinite().flatten(1).any(1)
     return [

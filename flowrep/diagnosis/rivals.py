@@ -371,6 +371,8 @@ def fitted_numbers(
 ) -> tuple[Tensor, float] | None:
     """Returns a rival's numbers `[P, k]`, fitted to the other half of the pairs, and their cost.
 
+    Of fewer than four pairs, all share a number.
+
     None if there are too few pairs, or if a factor is too large or too small.
 
     Args:

@@ -9,11 +9,12 @@ from typing import Any, Literal
 
 from flowrep.diagnosis.competition import Competition
 from flowrep.diagnosis.explanation import SURE, Explanation, most_noise_px
-from flowrep.diagnosis.fit import Pairs, length, median, residuals
+from flowrep.diagnosis.fit import Pairs, length, median, middle, residuals
+from flowrep.diagnosis.pictures import best_of
 from flowrep.diagnosis.rivals import Rival
 
-# An error that is smaller than each of these does nobody harm; one of three times that is no
-# longer "right".
+# An error that is smaller than one of these does nobody harm; one of three times that is no longer
+# "right".
 _HARMLESS_PX = 0.05
 _HARMLESS = 0.05  # of the flow's length
 _REST_PX = 0.25  # flow of a camera at rest: poses' noise is all that a correction may change
@@ -34,9 +35,9 @@ class Diagnosis:
         raw_px: median length of flow.
         left_px: median residual of the recorded data, |raw - ego| where flow is the reference.
         best_px: median residual with the best motion.
-        error_px: the error of the recorded motion, without the noise. If the verdict is "right",
-            the conventions are right to this many pixels.
-        rough_px: the noise of the recorded motion.
+        error_px: the error that all recorded motions may share. If the verdict is "right", the
+            conventions are right to this many pixels. nan without poses.
+        rough_px: the noise of single recorded motions.
         rivals_px: median residual after each correction, by correction.
         suspects: what corrects the data, the likeliest first; none if they are right.
         unseen: corrections that these data can neither confirm nor rule out.
@@ -50,7 +51,7 @@ class Diagnosis:
     left_px: float = math.nan
     best_px: float = math.nan
     error_px: float = math.nan
-    rough_px: float = 0.0
+    rough_px: float = math.nan
     rivals_px: Mapping[str, float] = field(default_factory=dict)
     suspects: tuple[str, ...] = ()
     unseen: tuple[str, ...] = ()
@@ -88,16 +89,18 @@ def judged(
         names: the names of the frames.
         instruction: tells the user what to do, given `Rival.remedy` and the corrected pairs.
     """
-    recorded, pairs, flow_px = found.recorded, found.recorded.pairs, found.flow_px
-    rivals = found.rivals
+    recorded, rivals, flow_px = found.recorded, found.rivals, found.flow_px
+    pairs, width = recorded.pairs, recorded.pairs.now.shape[-1]
     harmless_px = max(_HARMLESS_PX, _HARMLESS * flow_px)
     unsure_px = 3 * harmless_px
     # Flow's errors that are alike in all pictures, so that more pictures don't show them.
     bias_px = _HARMLESS_PX + _HARMLESS * flow_px if pairs.is_estimated else 0.0
     effects = {each: each.effect_px(recorded) for each in found.others}
     numbers: dict[str, Any] = {
-        "pairs": len(pairs.K), "raw_px": flow_px, "best_px": found.noise.typical_px,
+        "pairs": len(pairs.K), "raw_px": flow_px,
+        "best_px": median(middle(residuals(pairs, best_of(recorded.shown)))),
         **_errors_px(found, effects, bias_px), "left_px": _left_px(recorded),
+        "rivals_px": {e.rival.texts(e.n, width)[0]: _left_px(e) for e in found.others},
     }  # fmt: skip
     size, unknown = f"flow: {flow_px:.2g} px", f"and none of {len(rivals)} known mistakes explains"
 
@@ -109,11 +112,7 @@ def judged(
     if recorded.poses is not None:  # what pictures don't show can't be told from a mistake
         least_px = max(least_px, recorded.systematic_px()[1])
     if alike := _likeliest(found, effects, least_px, unsure_px + bias_px):
-        width = pairs.now.shape[-1]
         texts = [each.rival.texts(each.n, width) for each in alike]
-        numbers["rivals_px"] = {
-            each.rival.texts(each.n, width)[0]: _left_px(each) for each in found.others
-        }
         if alike[0].rival.is_vague:
             why = f"{texts[0][1]}, which changes flow by {effects[alike[0]]:.2g} px ({size})"
             return given("something is wrong", f"{why}, {unknown} it better")
@@ -154,17 +153,16 @@ def judged(
             why = f"flow estimated from the pictures has a noise of {found.noise.typical_px:.2g} px"
             why += f" ({size}); a finer flow.preset may do better"
         return given("can't tell", why)
-    if recorded.poses is None:
-        notes.append("poses and the unit of depth are not tested")
     outliers = 1 - float(recorded.shown.shares.amax(0).mean())
     if outliers > _HARMLESS and pairs.by_flow:
         notes.append(f"{outliers:.0%} of pixels don't fit: they move, or depth is wrong there")
-    parts = "raw flow, " * pairs.by_flow + "depth, K" + ", the camera's motion" * pairs.has_poses
-    agree = f"{parts} agree to within {numbers['error_px']:.2g} px ({size}), beside noise of "
-    agree += (
-        f"{found.noise.typical_px:.2g} px"
-        + f" and poses' {numbers['rough_px']:.2g} px" * pairs.has_poses
-    )
+    noise = f"({size}), beside noise of {found.noise.typical_px:.2g} px"
+    if recorded.poses is None:
+        notes.append("poses, K and the unit of depth are not tested")
+        return given("right", f"one motion explains raw flow and depth {noise}", notes=tuple(notes))
+    parts = "raw flow, " * pairs.by_flow + "depth, K, the camera's motion"
+    agree = f"{parts} agree to within {numbers['error_px']:.2g} px {noise}"
+    agree += f" and poses' {numbers['rough_px']:.2g} px"
     unseen = _unseen(pairs, rivals, max(numbers["error_px"], harmless_px))
     return given("right", agree, unseen=unseen, notes=tuple(notes))
 
@@ -175,7 +173,7 @@ def _errors_px(
     """Returns the error that data as recorded may hide, and the noise of their motions, px."""
     recorded = found.recorded
     if recorded.poses is None:
-        return {"error_px": bias_px, "rough_px": 0.0}
+        return {"error_px": math.nan, "rough_px": math.nan}
     rough_px = max(recorded.deviation_px, *recorded.poses.noise_px)
     noise = {"poses": rough_px, "flow": found.noise.typical_px}
     # What the data don't refute may be so, unless it is their noise that changes.
@@ -225,13 +223,11 @@ def _likeliest(
 
 
 def _left_px(each: Explanation) -> float:
-    return median(length(residuals(each.pairs, each.motion)).nanmedian(-1).values)
+    return median(middle(residuals(each.pairs, each.motion)))
 
 
 def _unseen(pairs: Pairs, rivals: Sequence[Rival], least: float) -> tuple[str, ...]:
     """Returns the corrections whose usual mistake would not change the residuals here."""
-    if not pairs.has_poses:
-        return ()
     pairs, unseen = pairs.few, []
     now = residuals(pairs, pairs.motion)
     for rival in rivals:

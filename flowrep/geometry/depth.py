@@ -1,4 +1,7 @@
-"""Conversion of depth from simulators and cameras to depth along the optical axis."""
+"""Conversion of depth from simulators and cameras to depth along the optical axis.
+
+What flow makes of depth that is unknown or infinite is said at `flowrep.geometry.ego_flow`.
+"""
 
 from __future__ import annotations
 

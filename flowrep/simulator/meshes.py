@@ -326,7 +326,10 @@ def _ring(sides: int, radius_m: float, z: float) -> Array:
 
 
 def person_meshes(variant: int) -> tuple[Mesh, ...]:
-    """Returns the meshes of a person's `PARTS`, facing along x; the origin of a leg is its hip."""
+    """Returns the meshes of a person's `PARTS`, facing along x; the origin of a leg is its hip.
+
+    They stand in the cylinder that collides, whose size is in `flowrep.scenes.pedestrians`.
+    """
     shirt, skin = swatch(SHIRTS[variant % len(SHIRTS)]), swatch("skin")
     body = Mesh()
     # One arm swings forward, one back. Seen from the side, as people who cross the street are, the
