@@ -34,7 +34,7 @@ from flowrep.diagnosis.recordings import (
 from flowrep.diagnosis.rivals import rivals_of
 from flowrep.diagnosis.verdict import Diagnosis, judged
 
-_PAIRS = 8  # that are tested at most, to save time
+_PAIRS = 12  # that are tested at most, to save time
 # A body counts in each frame that shows it.
 _BODIES = 24  # that are tested at most, to save time
 _MOVED_PX = 0.25  # least flow or residual of a body that is tested: with less, it is at rest
@@ -288,7 +288,8 @@ def _bodies(seen: _Seen) -> tuple[str, str]:
     best = flow_of(pairs, pictures.best_of(shown))
     off_px = median(middle(best - flow_of(pairs, pairs.motion)))
     most_px = explanation.most_noise_px(pairs, competition.flow_px)
-    if explanation.clipped_sum(shown.nats - exact.nats) > explanation.SURE and off_px > most_px:
+    gain = explanation.clipped_sum(shown.nats - exact.nats)
+    if gain > max(explanation.SURE, 5 * len(bodies)) and off_px > most_px:  # 5 nats for each
         why = f"another motion, {off_px:.2g} px from theirs, fits their pixels better"
         return "fault", f"instance_motion or ids don't fit the bodies: {why}"
     if not found.is_right:

@@ -127,11 +127,13 @@ def judged(
     is_world = recorded.shown.shares.amax(0) > 0.5
     if recorded.poses is not None and is_world.double().mean() > 0.5:
         resolution_px = recorded.systematic_px()[1]
-        if found.rule_nats > SURE and found.rule_px > unsure_px and not pairs.is_estimated:
+        # A body that is hidden in the noise pulls the world's motion by about as much.
+        least_px = max(unsure_px, _NOISE * found.noise.typical_px)
+        if found.rule_nats > SURE and found.rule_px > least_px and not pairs.is_estimated:
             why = f"errors of poses follow a rule, {found.rule_px:.2g} px ({size})"
             return given("something is wrong", f"{why}, {unknown} it")
         off_px, sigma_px = recorded.poses.y.norm(dim=-1), recorded.poses.sigma_px
-        if recorded.deviation_px > max(most_px, 2 * resolution_px):
+        if recorded.deviation_px > max(most_px, least_px, 2 * resolution_px):
             why = f"the recorded motion is {recorded.deviation_px:.2g} px from that of the pictures"
             return given("something is wrong", f"{why} ({size}), {unknown} it")
         is_bad = recorded.poses.is_bad & is_world & (off_px > _NOISE * sigma_px)
