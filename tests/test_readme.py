@@ -50,7 +50,7 @@ def test_the_readmes_agents_are_those_of_the_results_and_of_the_trained_agents_c
     (row,) = re.findall(r"^\|recipe 3.*\|SR\|`\[ego,obj\]`\|.*", results, re.MULTILINE)
     assert [cell.strip() for cell in taught] == row.split("|")[5:8]
     card = (README.parent / "flowrep" / "pretrained" / "README.md").read_text(encoding="utf-8")
-    (row,) = re.findall(r"^\| Straight Road \|.*", card, re.MULTILINE)
+    row, *_ = re.findall(r"^\| Straight Road \|.*", card, re.MULTILINE)
     assert [cell.split()[0] for cell in demo] == [f"{float(c):.0f}" for c in row.split("|")[2:5]]
 
 

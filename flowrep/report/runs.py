@@ -181,7 +181,7 @@ def _settings(config: Mapping[str, Any]) -> dict[str, str]:
     return {
         key: str(_without_fractions(value))
         for key, value in flattened(parts).items()
-        if value != {}
+        if value is not None and value != {}  # options that are off may be younger than a run
     }
 
 

@@ -379,7 +379,7 @@ class FlowFactorize(FlowTransform):
         outputs: Sequence[str] = ("ego", "obj"),
         scale: float | Mapping[str, float] = 1.0,
         movable: NestedKey | None = None,
-        noise_scales: float = 0.0,
+        noise_scales: float | None = None,
         compiled: bool = False,
         in_keys: Keys | None = None,
         out_keys: Keys | None = None,
@@ -397,10 +397,14 @@ class FlowFactorize(FlowTransform):
         options |= {"prev_intrinsics": prev_intrinsics}
         super().__init__(intrinsics, reads, keys, out_keys, **options)
         self.has_movable = movable is not None
-        wanted = "a finite number of at least 0"
-        self.noise_scales = checked_number("noise_scales", noise_scales, wanted, lambda x: x >= 0)
-        if self.noise_scales and "obj" not in outputs:
-            raise ValueError(f"noise_scales={noise_scales} is for obj, which {outputs} lacks")
+        self.noise_scales = noise_scales
+        if noise_scales is not None:
+            wanted = "a finite number of at least 0"
+            self.noise_scales = checked_number(
+                "noise_scales", noise_scales, wanted, lambda x: x >= 0
+            )
+            if "obj" not in outputs:
+                raise ValueError(f"noise_scales={noise_scales} is for obj, which {outputs} lacks")
         if self.scales.get("raw", 1.0) != 1.0:
             check_distinct_keys(self)
 

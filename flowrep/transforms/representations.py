@@ -141,7 +141,7 @@ def representation_stack(
     # RawFlow factorises exact flow in the same pass, but not by noisy depth.
     by_pass = [name for name in flows if name == "raw" or keys["depth"] == DEPTH_KEY]
     # Elsewhere, obj needs flow in px/step, as does an estimate of the motion.
-    noise_scales = flows.get("obj", {}).get("noise_scales", 0.0)
+    noise_scales = flows.get("obj", {}).get("noise_scales")
     splits = "obj" in flows and (estimator is not None or "obj" not in by_pass or noise_scales)
     needs_unscaled = splits or estimates_motion
     unscaled = _UNSCALED_KEY if estimator is None else _ESTIMATED_FLOW_KEY
