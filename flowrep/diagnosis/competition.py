@@ -19,6 +19,7 @@ from flowrep.geometry.egomotion import motion_of_points
 
 _SCORED = 9  # corrections of the data that compete in full, those that fit best with exact poses
 NO_RIVAL = Rival("poses", "", "", lambda pairs, n: pairs)
+STILL = Rival("poses", "", "", lambda pairs, n: pairs._replace(path=EYE.expand_as(pairs.path)))
 OF_NOISE = Rival("flow", "", "", lambda pairs, n: pairs._replace(gain=1e-3 * pairs.gain))
 
 
@@ -30,6 +31,7 @@ class Competition:
         recorded: the data as recorded.
         others: each rival's.
         of_noise: that raw flow is noise, if there are rivals that change raw flow.
+        still: that the camera stands still.
         noise: that of all explanations.
         flow_px: the median length of flow.
         rule_px: the errors of poses that a rule predicts, see `explanation.by_a_rule`.
@@ -99,6 +101,7 @@ class Competition:
         self.others += [
             self._of_poses(rival, n) for rival, n, _ in tried if rival.subject == "poses"
         ]
+        self.still = self._of_poses(STILL, none) if self._has_poses else None
         self.rule_px = self.rule_nats = 0.0
         if self.recorded.poses is not None and len(pairs.K) >= 8:
             rule = explanation.by_a_rule(self.recorded)
@@ -109,10 +112,9 @@ class Competition:
             self.rule_nats = explanation.clipped_sum(after.nats - self.recorded.poses.nats)
 
     def is_seen(self, other: Explanation) -> bool:
-        """Whether a change of raw flow explains it better than that it is noise."""
-        if other.rival.subject != "flow" or self.of_noise is None:
-            return True
-        return other.nats - self.of_noise.nats > explanation.SURE
+        """Whether data show what it needs: raw flow beyond noise, or else a camera that moves."""
+        null = self.of_noise if other.rival.subject == "flow" else self.still
+        return null is None or other.nats - null.nats > explanation.SURE
 
     def _of_poses(self, rival: Rival, n: Tensor) -> Explanation:
         """Returns a rival that changes poses alone: pictures show what they do as recorded."""
