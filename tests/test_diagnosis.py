@@ -132,6 +132,14 @@ def test_without_poses_flow_depth_and_K_are_judged_among_themselves():
     assert "flow_channels=row_column" in " ".join(wrong.diagnosis().suspects)
 
 
+def test_a_frame_without_a_pose_does_not_hide_that_the_others_are_wrong():
+    frames, found = frames_of(with_mistake("poses OpenGL")), Examination()
+    frames[3] = dataclasses.replace(frames[3], world_from_cam=None)
+    for previous, current in pairwise(frames):
+        found.add(previous, current, current.raw)
+    assert found.diagnosis().suspects == ("pose_axes=opengl",)
+
+
 def test_what_hardly_moves_or_is_hardly_known_tells_nothing():
     right = drawn(ROOM)
     still = examined(right.with_(flow=0 * right.flow, poses=right.poses[[0] * 10],
@@ -142,6 +150,7 @@ def test_what_hardly_moves_or_is_hardly_known_tells_nothing():
     unknown[:, 1:] = np.nan
     unknown[:, 0, 40:] = np.nan
     assert "too few" in examined(right.with_(depth=unknown)).words
+    assert "too few" in examined(right.with_(depth=np.inf * right.depth)).words
     assert "no two" in Examination().diagnosis().words
 
 
@@ -263,8 +272,14 @@ def test_what_is_no_rollout_is_refused(frames):
         diagnose(td[0], K)
     with pytest.raises(ValueError, match="depth"):
         diagnose(td.exclude(("sensor", "depth")), K)
+    with pytest.raises(ValueError, match="successive"):
+        diagnose(td.expand(0, *td.shape), K)
     with pytest.raises(ValueError, match=r"K\.T"):
         diagnose(td, K.T)
+    for other in (K.expand(len(td), 3, 3), [50.0, 50.0, 30.0, 20.0], None):
+        with pytest.raises(ValueError, match="K must be"):
+            diagnose(td, other)
+    assert spoilt(frames, prev_from_curr=lambda motion: torch.nan * motion).verdict == "can't tell"
 
 
 def test_the_street_and_its_transforms_are_right():

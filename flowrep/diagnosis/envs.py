@@ -87,10 +87,10 @@ def diagnose(
     'right'
     """
     now, before, earlier, later = _successive(frames)
-    both = (x["sensor", "K"] if intrinsics is None else intrinsics for x in (now, before))
-    K, prev_K = (torch.as_tensor(each).float().expand(len(now), 3, 3) for each in both)
-    geometry.check_intrinsics("K", K)
+    K, prev_K = (_intrinsics(x, intrinsics) for x in (now, before))
     kept = _motion(now).isfinite().flatten(1).all(1).nonzero()[:, 0]
+    if not len(kept):
+        return no_diagnosis(["no camera motion between two frames is known"])
     kept = kept[_spread(len(kept), 2 * _PAIRS)]
     seen = _Seen(now[kept], before[kept], K[kept], prev_K[kept], raw_key)
     if bool((seen.depth < 0).double().mean() > 0.5):
@@ -131,6 +131,17 @@ def _spread(count: int, most: int) -> Tensor:
     return torch.linspace(0, count - 1, min(count, most)).long()
 
 
+def _intrinsics(frames: TensorDictBase, given: Any) -> Tensor:
+    K: Tensor | None = frames.get(("sensor", "K"), None)
+    if given is not None:
+        K = torch.as_tensor(given).float()
+    if K is None or (given is not None and K.shape != (3, 3)):
+        got = "none" if K is None else list(K.shape)
+        raise ValueError(f'K must be [3, 3], or each frame\'s in ("sensor", "K"); got {got}')
+    geometry.check_intrinsics("K", K)
+    return K.float().expand(len(frames), 3, 3)
+
+
 def _motion(frames: TensorDictBase) -> Tensor:
     motion, rows = (frames.get(("sensor", k), None) for k in ("prev_from_curr", "instance_motion"))
     if motion is None and rows is None:
@@ -142,6 +153,8 @@ def _successive(frames: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase,
     """Returns frames, those before them, and the motions before and after, nan where unknown."""
     if frames.get(("sensor", "depth"), None) is None:
         raise ValueError('frames lack ("sensor", "depth"), which make_env(keep_sensor=True) keeps')
+    if 0 in frames.shape:
+        raise ValueError(f"there are no successive frames in a batch of {list(frames.shape)}")
     if frames.get(("next", "sensor", "depth"), None) is not None:
         frames = frames if frames.ndim else frames.unsqueeze(0)
         before, now = frames.exclude("next"), frames["next"]

@@ -71,14 +71,17 @@ class Examination:
     @torch.no_grad()
     def diagnosis(self) -> Diagnosis:
         """Returns the diagnosis of all pairs so far."""
-        used = tested(self._reasons)
+        posed = [pairs.has_poses for pairs, _ in self._seen]
+        is_lost = [any(posed) and not each for each in posed]
+        reasons = ["a pose is unknown" if x else why for x, why in zip(is_lost, self._reasons)]
+        used = tested(reasons)
         if not used:
-            return no_diagnosis(self._reasons)
+            return no_diagnosis(reasons)
         parts, names = zip(*(self._seen[i] for i in used))
         options = {"by_flow": True, "of_flow": self.flow_is_recorded, "absolute": True}
         rivals = rivals_of(self.conventions, **options)
         result = judged(Competition(Pairs.joined(parts), rivals), names, self._instruction)
-        return replace(result, notes=(*result.notes, *note_on_untested(self._reasons)))
+        return replace(result, notes=(*result.notes, *note_on_untested(reasons)))
 
     def _instruction(self, remedy: str, corrected: Pairs) -> str:
         words, given = remedy.split(" "), self.conventions
@@ -105,7 +108,8 @@ def reasons_untestable(pairs: Pairs) -> list[str]:
     still = fit.EYE.expand(len(pairs.K), 4, 4)
     seen = fit.middle(fit.residuals(pairs, still)).nan_to_num(0.0)
     moves = torch.maximum(seen, ego) >= _LEAST_MOVEMENT_PX
-    number, has_depth = (~pairs.depth.isnan()).sum(-1), pairs.now.isfinite().flatten(1).any(1)
+    has_depth, known = pairs.now.isfinite().flatten(1).any(1), ~pairs.depth.isnan()
+    number = known.sum(-1) * pairs.depth.isfinite().any(-1)  # the sky alone has no depth to judge
     return [
         "depth is nowhere known" if not is_known
         else "too few pixels are known" if count < _LEAST_PIXELS
