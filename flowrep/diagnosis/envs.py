@@ -44,6 +44,7 @@ _WORLD_SHARE = 0.2  # of the picture: with more of id 0, it is the world if moti
 # Flow that is computed again differs by rounding: by these pixels, and by this share of its length.
 _SAME_PX = 0.02
 _SAME_SHARE = 0.01
+_NOISY = 0.25  # share of flow's length by which noise of sensors may change it
 _ADAPTERS = {
     "pose_layout": "AdaptPose", "pose_direction": "AdaptPose", "pose_axes": "AdaptPose",
     "depth_kind": "AdaptDepth", "near_m": "AdaptDepth", "far_m": "AdaptDepth",
@@ -242,6 +243,8 @@ def _recomputed(seen: _Seen, ego_key: str, obj_key: str) -> tuple[list[str], lis
             continue
         if 1e-3 < factor < 1e3 and as_factor_px < px / 20:
             odd.append(f"{description}, but {factor:.3g} times that (a scale, or px/s)")
+        elif px < _NOISY * size_px:
+            odd.append(f"{description} ({px:.2g} px off), as if one had noise")
         else:
             faults.append(f"{description} ({px:.2g} px off)")
     return faults, odd
