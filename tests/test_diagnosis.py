@@ -44,6 +44,16 @@ def test_a_camera_that_is_backing_out_between_bodies_is_right_by_noisy_depth_alo
     assert found_of(drawn(48)).is_right
 
 
+def test_a_camera_at_rest_with_rough_poses_is_right_since_flow_is_noise():
+    assert drawn(119).kind[1] == "standstill"
+    assert found_of(drawn(119)).is_right
+
+
+def test_the_recorded_motion_may_be_that_of_fewer_than_half_of_the_pixels():
+    assert drawn(30046).moving > 0.55
+    assert found_of(drawn(30046)).is_right
+
+
 @pytest.mark.parametrize(
     ("name", "seed"),
     [
