@@ -54,6 +54,14 @@ def test_the_recorded_motion_may_be_that_of_fewer_than_half_of_the_pixels():
     assert found_of(drawn(30046)).is_right
 
 
+def test_flow_that_mostly_follows_no_motion_is_not_called_right():
+    right, random = drawn(ROOM), np.random.default_rng(0)
+    flow, is_lost = right.flow.copy(), random.random(right.flow.shape[-2:]) < 0.7
+    flow[:, :, is_lost] = random.uniform(-15, 15, flow[:, :, is_lost].shape)
+    found = examined(right.with_(flow=flow))
+    assert (found.verdict, "follow no motion" in found.words) == ("can't tell", True)
+
+
 @pytest.mark.parametrize(
     ("name", "seed"),
     [

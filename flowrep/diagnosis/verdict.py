@@ -146,7 +146,9 @@ def judged(
             notes.append(f"poses that don't fit the others: {', '.join(bad)}")
         if recorded.deviation_px > max(2 * resolution_px, harmless_px):
             notes.append("the poses are rough: motion estimated from flow and depth fits better")
-    if pairs.by_flow and (lost := 1 - float(recorded.shown.shares.sum(0).mean())) > 0.5:
+    # By the pixels, not the shares: motions that are alternatives share the same pixels.
+    explained = recorded.shown.odds.amax(0)[~pairs.depth.isnan()]
+    if pairs.by_flow and (lost := 1 - float(explained.mean())) > 0.5:
         why = f"{lost:.0%} of pixels follow no motion, neither the camera's nor a body's"
         return given("can't tell", why)
     if numbers["error_px"] > unsure_px:
