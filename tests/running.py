@@ -1,6 +1,8 @@
-"""Python in a process of its own."""
+"""Python in a process of its own, and commands in this one."""
 
+import importlib
 import os
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -13,3 +15,21 @@ def run_python(*arguments, env=ENVIRONMENT, **options):
     """Runs Python on this checkout, with one thread, and returns how it ended and what it said."""
     command = [sys.executable, *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, env=env, **options)
+
+
+def run_here(monkeypatch, command):
+    """Runs `python -m flowrep.train ...` or `python file.py ...` in this process; returns its code.
+
+    Nothing has to be imported again, which takes a command seconds.
+    """
+    name, *arguments = [word for word in command[1:] if word != "-m"]
+    monkeypatch.setattr(sys, "argv", [name, *arguments])
+    try:
+        if name.endswith(".py"):
+            runpy.run_path(name, run_name="__main__")
+        else:
+            module = f"{name}.__main__" if name == "flowrep.report" else name
+            importlib.import_module(module).main()
+    except SystemExit as ended:
+        return ended.code or 0
+    return 0

@@ -1,7 +1,6 @@
 """docs/adding_a_representation.md: a transform and a YAML file outside of a clone are enough."""
 
 import importlib
-import os
 import re
 import sys
 
@@ -20,7 +19,7 @@ from flowrep.experiment.schema import EvaluateConfig
 from flowrep.geometry import ego_flow
 from flowrep.train import resumed
 from tests.config.composing import composed, plain
-from tests.running import ENVIRONMENT, ROOT, run_python
+from tests.running import ROOT, run_here
 
 PAGE = ROOT / "docs" / "adding_a_representation.md"
 TYPED = "+representations.contact._target_=mine.TimeToContact"
@@ -141,18 +140,11 @@ def test_a_name_that_no_map_can_have_is_not_offered_as_an_override(config, folde
 
 
 @pytest.mark.slow
-def test_from_the_command_line(folder):
-    def run(command, *arguments):
-        env = ENVIRONMENT | {"PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])}
-        return run_python("-m", f"flowrep.{command}", *arguments, env=env, cwd=folder)
-
-    done = run(
-        "train", "--config-dir", "my_configs", "representations=[ego,contact]", "debug=smoke",
-        TYPED.lstrip("+"),
-        "device=cpu", "representations.contact.steps=5", "hydra.run.dir=run", "total_frames=64",
-        "scene.time_limit_steps=20", "evaluation.speeds=[low]", "evaluation.baselines=[]",
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    evaluate = "run=run", "episodes=1", "speed=low", "baselines=[]", "num_workers=0", "device=cpu"
-    done = run("evaluate", *evaluate, "num_envs=1", TYPED)
-    assert done.returncode == 0, done.stderr
+def test_from_the_command_line(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    line = "python -m flowrep.train --config-dir my_configs representations=[ego,contact]"
+    line += " representations.contact.steps=5 debug=smoke device=cpu hydra.run.dir=run"
+    line += " total_frames=64 scene.time_limit_steps=20 evaluation.speeds=[low]"
+    assert run_here(monkeypatch, [*line.split(), TYPED.lstrip("+"), "evaluation.baselines=[]"]) == 0
+    line = "python -m flowrep.evaluate run=run episodes=1 speed=low baselines=[] num_workers=0"
+    assert run_here(monkeypatch, [*line.split(), "device=cpu", "num_envs=1", TYPED]) == 0

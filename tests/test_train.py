@@ -13,55 +13,61 @@ pytest.importorskip("pybullet", reason="training drives the simulated street")
 
 from flowrep.files import read_rows
 from flowrep.train import main
-from tests.running import ENVIRONMENT, run_python
+from tests.running import ENVIRONMENT, run_here, run_python
 
 pytestmark = pytest.mark.slow
-
-
-def command(name, *arguments, cwd):
-    result = run_python("-m", f"flowrep.{name}", *arguments, cwd=cwd)
-    assert result.returncode == 0, result.stderr
-    return result.stdout
 
 
 @pytest.fixture(scope="module")
 def smoke_run(tmp_path_factory):
     """One `debug=smoke` run in a folder of its own; gives the run folder and what was printed."""
     folder = tmp_path_factory.mktemp("empty")
-    printed = command("train", "debug=smoke", "seed=3", "scene.time_limit_steps=60", cwd=folder)
+    line = "-m flowrep.train debug=smoke seed=3 scene.time_limit_steps=60"
+    result = run_python(*line.split(), cwd=folder)
+    assert result.returncode == 0, result.stderr
     (run,) = folder.glob("outputs/*/*_straight_road_ego+obj_s3")
-    return run, printed
+    return run, result.stdout
 
 
-@pytest.mark.parametrize(
-    ("line", "code"),
-    [
-        ("train --help", 0),
-        ("train total_frames=abc", 2),
-        ("evaluate --help", 0),
-        ("evaluate episodes=0", 2),
-        ("factorize --help", 0),
-        ("factorize input=x output=y format=frames video_fps=0", 2),
-        ("report --help", 0),
-        ("report x policy=fast", 2),
-        ("view --help", 0),
-        ("view speed=fast", 2),
-        # no such folder or file
-        ("train resume=nothing", 2),
-        ("evaluate run=nothing", 2),
-        ("evaluate policy=nothing.py:make scene=s_turn representations=[ego]", 2),
-        ("factorize input=nothing output=out format=tum", 2),
-        ("report nothing", 2),
-        ("view policy=nothing.py:make", 2),
+REFUSED = {
+    "train": ["total_frames=abc", "resume=nothing"],
+    "evaluate": [
+        "episodes=0",
+        "run=nothing",
+        "policy=nothing.py:make scene=s_turn representations=[ego]",
     ],
-)
-def test_help_and_refusals_need_no_pytorch_and_no_folder(tmp_path, line, code):
-    name, *arguments = line.split()
-    result = run_python("-X", "importtime", "-m", f"flowrep.{name}", *arguments, cwd=tmp_path)
-    assert result.returncode == code
-    imported = {text.rpartition("|")[2].strip() for text in result.stderr.splitlines()}
+    "factorize": [
+        "input=x output=y format=frames video_fps=0",
+        "input=nothing output=out format=tum",
+    ],
+    "report": ["x policy=fast", "nothing"],
+    "view": ["speed=fast", "policy=nothing.py:make"],
+}
+RUN_EACH_LINE = """
+import runpy, sys
+name, *lines = sys.argv[1:]
+codes = []
+for line in lines:
+    sys.argv = [name, *line.split()]
+    try:
+        runpy.run_module(f"flowrep.{name}", run_name="__main__", alter_sys=True)
+        codes.append(0)
+    except SystemExit as ended:
+        codes.append(ended.code)
+print("", *codes, sep="\\n")
+print(*sys.modules)
+"""
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_help_and_refusals_need_no_pytorch_and_no_folder(tmp_path, name):
+    lines = "--help", *REFUSED[name]
+    result = run_python("-c", RUN_EACH_LINE, name, *lines, cwd=tmp_path, check=True)
+    *codes, imported = result.stdout.splitlines()[-len(lines) - 1 :]
+    assert codes == ["0"] + ["2"] * len(REFUSED[name])
+    imported = imported.split()
     assert "pydantic" in imported
-    assert not {"torch", "matplotlib", "pybullet", "cv2", "scipy.stats"} & imported
+    assert not {"torch", "matplotlib", "pybullet", "cv2", "scipy.stats"} & {*imported}
     assert not [*tmp_path.iterdir()]
 
 
@@ -112,24 +118,25 @@ def test_a_run_says_what_it_is_where_it_runs_and_how_it_went(smoke_run):
     assert [word for word in what + how if word not in smoke_run[1]] == []
 
 
-def test_a_complete_run_is_not_evaluated_twice(smoke_run):
+def test_a_complete_run_is_not_evaluated_twice(smoke_run, monkeypatch, capsys):
     run, _ = smoke_run
     before = (run / "evaluation.csv").read_text()
     film = run / "videos" / "episode_normal.mp4"
     film.unlink()
-    assert "this run is complete" in command("train", f"resume={run}", cwd=run)
+    assert run_here(monkeypatch, ["python", "-m", "flowrep.train", f"resume={run}"]) == 0
+    assert "this run is complete" in capsys.readouterr().out
     assert film.stat().st_size > 1e4
     assert (run / "evaluation.csv").read_text() == before
 
 
-def test_a_run_on_estimated_flow_is_trained_evaluated_and_filmed(tmp_path):
+def test_a_run_on_estimated_flow_is_trained_evaluated_and_filmed(tmp_path, monkeypatch):
     pytest.importorskip("cv2", reason="flow is estimated by OpenCV")
-    asked = ["flow=estimated", "flow.preset=ultrafast", "motion=estimated", "total_frames=64"]
-    asked += ["scene.time_limit_steps=40"]
-    asked += ["evaluation.final_episodes=1", "evaluation.every_frames=0", "evaluation.baselines=[]"]
-    asked += ["evaluation.policies=[greedy]"]
+    monkeypatch.chdir(tmp_path)
+    line = "python -m flowrep.train debug=smoke flow=estimated flow.preset=ultrafast"
+    line += " motion=estimated total_frames=64 scene.time_limit_steps=40 hydra.run.dir=run"
+    line += " evaluation.final_episodes=1 evaluation.every_frames=0 evaluation.baselines=[]"
+    assert run_here(monkeypatch, [*line.split(), "evaluation.policies=[greedy]"]) == 0
     run = tmp_path / "run"
-    command("train", "debug=smoke", *asked, f"hydra.run.dir={run}", cwd=tmp_path)
     assert "motion: estimated" in (run / "config.yaml").read_text()
     rows = read_rows(run / "evaluation.csv")
     assert [(row["speed"], row["policy"]) for row in rows] == [
@@ -138,9 +145,7 @@ def test_a_run_on_estimated_flow_is_trained_evaluated_and_filmed(tmp_path):
     assert (run / "videos" / "episode_normal.mp4").stat().st_size > 1e4
 
 
-@pytest.mark.parametrize(
-    ("number", "num_workers"), [(signal.SIGINT, 2), (signal.SIGHUP, 2), (signal.SIGHUP, 0)]
-)
+@pytest.mark.parametrize(("number", "num_workers"), [(signal.SIGINT, 2), (signal.SIGHUP, 0)])
 def test_an_interrupted_run_saves_and_says_how_to_go_on(
     tmp_path, short_folder, number, num_workers
 ):

@@ -17,8 +17,13 @@ import torch.utils.tensorboard  # noqa: F401
 import flowrep.train
 from flowrep import files
 from flowrep.agent import checkpoint
+from flowrep.envs import StreetEnv
 from flowrep.experiment.run import RunFolder
 from flowrep.experiment.schema import validated_run
+
+# what a run would load late, too: compiled code, once a street is drawn
+STREET = StreetEnv("straight_road")
+STREET.reset(seed=0)
 
 
 def die(*_, **__):

@@ -21,8 +21,8 @@ from tests.comparing import differing
 from tests.config.composing import composed
 
 SCENES = sorted(group_choices("scene"))
-# of 20 episodes; one that never turns drives Straight Road in one of ten, the other scenes never
-LEAST = {"straight_road": 16, "s_turn": 16, "h_shaped_pathways": 16, "three_way_junction": 18}
+# of 10 episodes; one that never turns drives Straight Road in one of ten, the other scenes never
+LEAST = 8
 
 
 TINY = {
@@ -81,16 +81,6 @@ def test_what_is_saved_is_the_config_of_the_training_not_of_another_scene(traine
     assert Agent.load(tmp_path / "by_hand.safetensors", device="cpu").frames == 5
 
 
-def test_the_threads_of_the_program_that_trains_stay_its_own(tmp_path):
-    before = torch.get_num_threads()
-    torch.set_num_threads(3)
-    try:
-        Agent.train(folder=tmp_path / "run", **TINY)
-        assert torch.get_num_threads() == 3
-    finally:
-        torch.set_num_threads(before)
-
-
 def test_a_small_file_rounds_weights_to_a_byte(trained, tmp_path):
     agent, _, _ = trained
     for name, small in (("whole", False), ("small", True)):
@@ -134,12 +124,18 @@ def test_a_wrong_key_or_value_is_named_before_a_folder_is_made(tmp_path, given, 
     assert not (tmp_path / "run").exists()
 
 
-def test_ctrl_c_saves_the_run_and_is_raised(tmp_path):
+def test_ctrl_c_saves_the_run_and_is_raised_and_the_program_keeps_its_threads(tmp_path):
     def interrupt(row):
         signal.raise_signal(signal.SIGINT)
 
-    with pytest.raises(KeyboardInterrupt, match=str(tmp_path)):
-        Agent.train(folder=tmp_path / "run", callback=interrupt, **TINY)
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        with pytest.raises(KeyboardInterrupt, match=str(tmp_path)):
+            Agent.train(folder=tmp_path / "run", callback=interrupt, **TINY)
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
     assert Agent.load(tmp_path / "run", device="cpu").frames == 64  # the first row is at 64
 
 
@@ -152,7 +148,7 @@ def test_the_folder_of_another_run_is_refused(trained):
 def test_a_run_that_can_not_be_built_does_not_take_its_folder(tmp_path):
     with pytest.raises(ValueError, match="8"):  # too small a picture for the encoder
         Agent.train(folder=tmp_path / "run", **TINY, **{"scene.camera.height_px": 8})
-    Agent.train(folder=tmp_path / "run", **TINY)
+    RunFolder(tmp_path / "run").check_is_new()
 
 
 @pytest.mark.parametrize(
@@ -247,8 +243,8 @@ def test_every_scene_has_a_pretrained_agent_of_at_most_three_megabytes():
 
 @pytest.mark.parametrize("scene", [pytest.param(s, marks=pytest.mark.slow) for s in SCENES])
 def test_a_pretrained_agent_drives_where_never_turning_fails(scene):
-    episodes = Agent.load("pretrained", scene=scene, device="cpu").evaluate(20, seed=0)
-    assert sum(each.outcome == "success" for each in episodes) >= LEAST[scene]
+    episodes = Agent.load("pretrained", scene=scene, device="cpu").evaluate(10, seed=0)
+    assert sum(each.outcome == "success" for each in episodes) >= LEAST
 
 
 def test_a_saved_agent_computes_in_the_faster_format_of_this_machine(monkeypatch):

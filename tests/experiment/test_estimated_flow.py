@@ -30,7 +30,7 @@ def test_with_the_camera_compensated_what_stands_still_has_hardly_any_object_flo
     options += ["num_envs=2", "num_workers=0", "device=cpu"]
     env = build.env(composed(*options), keep_sensor=True, seed=0)
     planner, streets = BaselinePolicy("planner", env), torch.arange(2)
-    frames = env.rollout(40, lambda td: planner(td.set("env_id", streets)))["next"]
+    frames = env.rollout(24, lambda td: planner(td.set("env_id", streets)))["next"]
     K, sensor = torch.as_tensor(street_envs(env)[0].K).float(), frames["sensor"]
     env.close()
     depth, ids, motions = (sensor[key] for key in ("depth", "instance", "instance_motion"))

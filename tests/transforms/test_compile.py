@@ -9,7 +9,7 @@ from torch._dynamo.testing import CompileCounter
 from torchrl.envs.transforms import Compose
 
 from flowrep import transforms as T
-from tests.transforms.fake_env import INTRINSICS, NUM_CLASSES, moments
+from tests.transforms.fake_env import INTRINSICS, NUM_CLASSES, WALKER, moments
 
 KEY, POSE = ("sensor", "K"), ("sensor", "world_from_cam")
 POSES = "world_from_cam", "world_from_body"
@@ -175,6 +175,9 @@ def test_inductor_compiles_two_transforms_into_one_graph():
     stack = Compose(T.RawFlow(INTRINSICS), T.FlowFactorize(INTRINSICS))
     compiled, want = torch.compile(stack, fullgraph=True)(moments(3)), stack(moments(3))
     torch.testing.assert_close(compiled["obj"], want["obj"], atol=1e-5, rtol=1e-5)
+    stands = (want["sensor", "instance"] != WALKER).expand_as(want["obj"])
+    assert compiled["raw"][stands].abs().max() > 0
+    assert compiled["obj"][stands].abs().max() == 0
 
 
 def on(device, case):
