@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.running import ROOT, run_python
+from tests.running import ROOT, run_here
 
 
 @pytest.mark.slow
@@ -16,10 +16,8 @@ from tests.running import ROOT, run_python
         ("update.py --sizes tiny --rounds 1 --threads 1", 4),
     ],
 )  # fmt: skip
-def test_a_benchmark_prints_its_tables(arguments, rows):
-    script, *options = arguments.split()
-    result = run_python(ROOT / "benchmarks" / script, *options)
-    assert result.returncode == 0, result.stderr
-    tables = [line for line in result.stdout.splitlines() if line.startswith("| ")]
+def test_a_benchmark_prints_its_tables(monkeypatch, capsys, arguments, rows):
+    assert run_here(monkeypatch, ["python", *f"{ROOT}/benchmarks/{arguments}".split()]) == 0
+    tables = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
     heads = sum(set(line) <= set("| -") for line in tables)
     assert len(tables) - 2 * heads >= rows
