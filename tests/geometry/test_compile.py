@@ -56,8 +56,9 @@ def test_camera_is_one_graph():
 
 
 @pytest.mark.slow_after_first
-@pytest.mark.parametrize("dt", [0.25, torch.tensor([0.5, 2.0])])
-@pytest.mark.parametrize("prev_K", [None, 1.1 * K.float()])
+@pytest.mark.parametrize(
+    ("dt", "prev_K"), [(0.25, None), (torch.tensor([0.5, 2.0]), 1.1 * K.float())]
+)
 def test_flow_is_one_graph(dt, prev_K):
     compiled = torch.compile(everything, fullgraph=True, backend="eager")
     assert_same(compiled(*inputs(2), dt, prev_K), everything(*inputs(2), dt, prev_K))
