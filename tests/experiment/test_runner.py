@@ -2,6 +2,7 @@
 
 import math
 import re
+import shutil
 from pathlib import Path
 
 import pytest
@@ -187,13 +188,23 @@ def test_a_machine_that_emulates_the_run_s_number_format_says_so(tmp_path, monke
         assert ("bf16" in capsys.readouterr().out) is not is_there
 
 
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A run that is trained to its end."""
+    return trained(new_run(tmp_path_factory.mktemp("finished")))
+
+
+@pytest.fixture
+def copied(finished, tmp_path):
+    """The folder of a copy of the finished run."""
+    return shutil.copytree(finished.folder.path, tmp_path / "copied")
+
+
 @pytest.mark.slow
-def test_a_finished_run_is_made_longer_and_its_learning_rate_follows(tmp_path):
-    short = trained(new_run(tmp_path))
-    assert short.agent.updates == (120 - 16) // 10  # one for ten frames after the first batch
-    assert float(logged(short)[-1]["learning_rate"]) < 3e-4 / 5
-    longer = trained(new_run(tmp_path, resume=True, more=["total_frames=240"]))
-    rows = logged(longer)
+def test_a_finished_run_is_made_longer_and_its_learning_rate_follows(finished, copied):
+    assert finished.agent.updates == (120 - 16) // 10  # one for ten frames after the first batch
+    assert float(logged(finished)[-1]["learning_rate"]) < 3e-4 / 5
+    rows = logged(trained(new_run(copied, resume=True, more=["total_frames=240"])))
     assert [int(row["frames"]) for row in rows] == list(range(20, 241, 20))
     assert float(rows[6]["learning_rate"]) == pytest.approx(3e-4 * 0.5, rel=0.2)
     assert float(rows[-1]["learning_rate"]) < 3e-4 / 10
@@ -224,15 +235,14 @@ def saved(runner):
 
 
 @pytest.mark.slow
-def test_the_number_of_worker_processes_does_not_change_a_run(tmp_path, monkeypatch):
-    alone = finish(tmp_path / "alone")
+def test_the_number_of_worker_processes_does_not_change_a_run(finished, tmp_path, monkeypatch):
     monkeypatch.setattr("flowrep.envs.torchrl_env.available_cores", lambda: 64)
     first = new_run(tmp_path / "two", num_workers=2)  # which step while updates are taken
     trained(first, StopAfter(first, 50))
     monkeypatch.setattr("flowrep.envs.torchrl_env.available_cores", lambda: 1)
     second = new_run(tmp_path / "two", resume=True, num_workers=1)
     second.train(StopRequest())
-    assert differing(saved(alone), saved(second)) == []
+    assert differing(saved(finished), saved(second)) == []
     second.close()
 
 
@@ -265,9 +275,9 @@ def test_a_resumed_run_equals_the_uninterrupted_one_bit_for_bit(tmp_path, algori
 
 
 @pytest.mark.slow
-def test_a_checkpoint_whose_state_has_another_shape_is_one_error(tmp_path):
-    runner = trained(new_run(tmp_path))
-    path, runner = runner.folder.checkpoint_path, new_run(tmp_path)
+def test_a_checkpoint_whose_state_has_another_shape_is_one_error(copied):
+    runner = new_run(copied)
+    path = runner.folder.checkpoint_path
     whole = load_checkpoint(path)
     for part in ({"origin": 3}, {"frames": None}, {"agent": []}, {"memory": {}}, {"env": [1]}):
         save_checkpoint(path, whole | part)
