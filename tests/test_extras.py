@@ -50,7 +50,7 @@ def test_python_3_14_is_told_how_to_get_pybullet(monkeypatch):
         extras.require("flowrep.envs", "sim", "shapely")
 
 
-def test_a_command_ends_in_one_line_with_what_it_would_miss_at_its_end(monkeypatch):
+def test_a_command_names_a_package_that_it_needs_only_at_its_end(monkeypatch):
     monkeypatch.setattr(
         extras, "find_spec", lambda name: None if name == "imageio_ffmpeg" else name
     )

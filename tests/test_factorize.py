@@ -64,7 +64,7 @@ def test_a_full_disk_is_named(moments, tmp_path, monkeypatch):
         factorize(tmp_path)
 
 
-def test_all_that_is_written(moments, tmp_path):
+def test_a_job_writes_flow_pictures_masks_tables_and_a_video(moments, tmp_path):
     everything = ["flow_files=[flo,kitti,npz]", "pictures_every=2", "moving_px=0.01"]
     code, out = factorize(tmp_path, "flow=exact", *everything)
     assert code == 0
@@ -170,7 +170,7 @@ def test_a_job_that_was_killed_before_its_first_frame_is_in_nobodys_way(tmp_path
 
 
 @pytest.mark.parametrize("folder", ["out", ".", "..", "/", "link"])
-def test_what_is_there_is_not_overwritten(folder, tmp_path):
+def test_an_existing_output_is_not_overwritten(folder, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "link").symlink_to("nowhere")
     with pytest.raises(SequenceError, match=re.escape(folder)):
@@ -185,7 +185,9 @@ def test_what_is_there_is_not_overwritten(folder, tmp_path):
         (["flow=exact", "poses=estimated"], r"depth/0002\.png"),  # broken
     ],
 )
-def test_what_cannot_be_factorised_is_named_and_leaves_nothing(moments, tmp_path, overrides, named):
+def test_a_recording_that_cannot_be_factorised_is_named_and_writes_nothing(
+    moments, tmp_path, overrides, named
+):
     path = tmp_path / "in/depth/0002.png"
     if named.startswith("depth"):
         path.write_bytes(path.read_bytes()[:50])
@@ -239,7 +241,7 @@ def test_a_camera_whose_skipped_frame_begins_a_clip_gives_no_pair_across_it(tmp_
     assert pairs == [("0", "2"), ("4", "6")]
 
 
-def test_exact_flow_where_there_is_none(tmp_path):
+def test_exact_flow_of_a_recording_without_flow_is_refused(tmp_path):
     synthetic.write_sintel(tmp_path / "in")
     given = ["format.scene=cave", "flow=exact", "video=false"]
     with pytest.raises(UsageError, match=r"format\.backwards=true"):
@@ -281,7 +283,7 @@ def test_without_poses_the_cameras_motion_is_estimated(moments, tmp_path, capsys
         ("format._target_", "flowrep.sequences.Frame"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_is_refused_by_name(key, value, moments, tmp_path):
+def test_an_impossible_option_is_refused_by_name(key, value, moments, tmp_path):
     with pytest.raises(ValueError, match=key.removeprefix("+").replace("flow.", "")):
         factorize(tmp_path, f"{key}={value}")
 

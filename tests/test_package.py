@@ -74,7 +74,7 @@ def test_the_sdist_has_what_a_clone_has(built):
     assert {"mkdocs.yml", "CITATION.cff", "LICENSE", "Dockerfile", "examples/tensors.py"} <= names
 
 
-def test_installed_its_commands_and_configs_are_there(installed, tmp_path):
+def test_the_installed_wheel_has_its_commands_and_configs(installed, tmp_path):
     where = {"cwd": tmp_path, "env": {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}}
     code = (
         "import flowrep, flowrep.geometry; from flowrep.config import CONF_DIR;"

@@ -42,7 +42,8 @@ def stranger(tmp_path, monkeypatch):
         if key == ALGORITHM:
             config["algorithm"] = {"_target_": target}
         else:
-            config["representations"] = {"edges": {"_target_": target}}
+            name = key.removeprefix("+").removeprefix("representations.").removesuffix("._target_")
+            config["representations"] = {name: {"_target_": target}}
         run = RunFolder(tmp_path)
         run.write_config(config)
         return run
@@ -121,13 +122,20 @@ def test_an_algorithm_typed_for_a_run_that_has_another_is_not_ignored(tmp_path):
         resume(run, "algorithm._target_=mine.Own")
 
 
+STRANGE = ["a b.C", "a.B; rm -rf x", "a.B\x1b[2J", "evil:A", "evil", "$(x).y"]
+
+
 @pytest.mark.parametrize(
-    "target", ["a b.C", "a.B; rm -rf x", "a.B\x1b[2J", "evil:A", "evil", "$(x).y"]
+    ("key", "target"),
+    [
+        *((ALGORITHM, name) for name in STRANGE),
+        *((f"+{m}._target_", "evil.A") for m in STRANGE[:3]),
+    ],
 )
-def test_a_name_that_no_class_can_have_is_not_offered_as_an_override(stranger, target):
+def test_a_name_that_no_class_or_map_can_have_is_not_offered_as_an_override(stranger, key, target):
     with pytest.raises(UsageError) as refused:
-        evaluate(stranger(ALGORITHM, target))
-    assert "algorithm._target_=" not in str(refused.value)
+        evaluate(stranger(key, target))
+    assert "_target_=" not in str(refused.value)
     assert str(refused.value).isprintable()
 
 

@@ -250,7 +250,7 @@ import resource, runpy, sys
 keep_freed_memory = runpy.run_path(sys.argv[1])["keep_freed_memory"]  # without TorchRL
 def faults():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    for _ in range(5):
+    for _ in range(2):
         bytearray(b"x") * 80_000_000  # some 20,000 pages
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 by_default = faults()

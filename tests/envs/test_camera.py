@@ -6,7 +6,7 @@ import numpy as np
 import pybullet
 import pytest
 
-from flowrep.pybullet import BulletCamera, _depth_from_zbuffer
+from flowrep.pybullet import BulletCamera
 from flowrep.scenes.scene import CameraConfig
 
 NEAR_M, FAR_M = 0.2, 300.0
@@ -50,13 +50,6 @@ def test_the_sampled_intrinsics_put_unprojected_points_on_the_surface(slanted_pl
     # A street's camera has the same K.
     same = CameraConfig(height, width, fov_deg, 1.5, 0.0, 0.0, NEAR_M, FAR_M)
     np.testing.assert_allclose(same.K, camera.K, rtol=1e-6)
-
-
-def test_depth_buffer_ends_are_near_and_far():
-    # OpenGL: 0 is the near plane, 1 the far one; 0.5 of near 1, far 3 is 3 / (3 - 2 * 0.5) = 1.5.
-    depth = _depth_from_zbuffer(np.array([0.0, 0.5, 1.0], dtype=np.float32), 1.0, 3.0)
-    np.testing.assert_allclose(depth, [1.0, 1.5, 3.0], rtol=1e-6)
-    assert depth.dtype == np.float32
 
 
 def test_the_focal_length_follows_the_vertical_field_of_view():

@@ -108,7 +108,7 @@ def test_frames_come_in_flowreps_conventions_and_lost_tracking_starts_a_clip(sdk
     assert frame.timestamp_s == 2.5
 
 
-def test_what_is_not_there_is_named(sdk, monkeypatch, tmp_path):
+def test_a_missing_camera_recording_or_sdk_is_named(sdk, monkeypatch, tmp_path):
     monkeypatch.setattr(Camera, "opens", FAILED)
     with pytest.raises(SequenceError, match=r"^live: can't be opened: the ZED SDK says CAMERA_NOT"):
         list(ZedLive("live"))

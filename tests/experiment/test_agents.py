@@ -9,7 +9,6 @@ import torch
 
 pytest.importorskip("pybullet", reason="agents drive in the simulated street")
 
-import flowrep
 from flowrep.agent import CheckpointError, save_checkpoint
 from flowrep.config import group_choices
 from flowrep.config.usage import UsageError
@@ -226,10 +225,6 @@ def test_a_baseline_has_no_weights_to_save(tmp_path):
 def test_a_baseline_that_is_given_workers_drives_without_them():
     agent = Agent.load("never_turn", scene="straight_road", num_workers=1)
     assert len(agent.evaluate(2)) == 2
-
-
-def test_the_package_exports_the_agent():
-    assert flowrep.Agent is Agent
 
 
 # The agents that come with flowrep: that they load, see what they were trained on, and drive.

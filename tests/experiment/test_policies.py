@@ -55,7 +55,7 @@ def test_a_policy_sees_its_maps_and_nothing_of_the_env():
     assert seen[0].batch_size == (2,)
 
 
-def test_make_is_told_the_task_and_may_import_what_lies_beside_it(tmp_path):
+def test_make_receives_the_task_and_may_import_modules_beside_it(tmp_path):
     (tmp_path / "my_net.py").write_text("SIDE = 1\n")
     path = tmp_path / "mine.py"
     path.write_text(
@@ -66,7 +66,7 @@ def test_make_is_told_the_task_and_may_import_what_lies_beside_it(tmp_path):
     assert ForeignPolicy(f"{path}:make").built_for(TASK)(maps(3))["action"].tolist() == [2, 2, 2]
 
 
-def test_two_policies_do_not_share_what_lies_beside_one(tmp_path):
+def test_two_policies_import_their_own_modules_of_one_name(tmp_path):
     for number, name in enumerate(["first", "second"]):
         (tmp_path / name).mkdir()
         (tmp_path / name / "my_model.py").write_text(f"SIDE = {number}\n")
@@ -105,7 +105,7 @@ def test_wrong_actions_of_a_policy_are_named(given, said):
         ("def make(task): return lambda maps: maps['rgb']\n", "make", r"rgb.*mine\.py, line 1\)"),
     ],
 )
-def test_what_fails_in_a_policy_is_one_line_with_its_place(tmp_path, body, name, said):
+def test_an_error_in_a_policy_is_one_line_with_file_and_line_number(tmp_path, body, name, said):
     path = tmp_path / "mine.py"
     path.write_text(body)
     with pytest.raises(PolicyError, match=said) as caught:

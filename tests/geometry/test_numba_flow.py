@@ -79,7 +79,7 @@ def test_flow_of_bodies_and_of_a_camera(calls, ids, zooms, dt):
     assert bool(flow.valid[1].any()) == is_known
 
 
-def test_factors_and_what_they_share(calls):
+def test_factors_equal_pytorchs_alone_and_beside_raw_flow(calls):
     depth, instance, Ks, motions = scene()
     raw = rigid_flow(depth, instance, Ks, motions).flow
     factors = factorize(raw, depth, Ks, motions[:, 0])

@@ -94,7 +94,7 @@ def test_nothing_to_report_on_is_one_line(tmp_path, monkeypatch, capsys, damaged
     assert (f"{tmp_path}/run/config.yaml" in said.out) == damaged
 
 
-def test_what_was_found_is_printed_and_where_it_was_written(tmp_path, monkeypatch, capsys):
+def test_the_command_prints_results_and_the_path_of_the_page(tmp_path, monkeypatch, capsys):
     run = run_in(tmp_path, "run", "soccc")
     monkeypatch.setattr(sys, "argv", ["flowrep-report", str(run), f"output={tmp_path / 'out'}"])
     main()

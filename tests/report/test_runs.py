@@ -19,7 +19,7 @@ def names(runs):
 
 
 @pytest.mark.parametrize("name", ["wandb", ".hydra"])
-def test_runs_are_found_wherever_they_lie_and_once(tmp_path, name):
+def test_each_run_is_found_once_at_any_depth(tmp_path, name):
     # the name means nothing above a run; inside of one it is of what is no run
     run_in(tmp_path / name / "sweep", "a")
     inside = run_in(tmp_path / name, "b", seed=1) / name

@@ -148,7 +148,7 @@ def test_pairs_in_runs_spread_over_the_recording_are_examined():
     assert diagnosis.pairs == 20
 
 
-def test_what_moves_stands_out_of_the_frames_own_error():
+def test_moving_pixels_exceed_the_frames_own_error():
     # Errors of 2 px everywhere are not movers, 9 px are.
     raw = np.zeros((2, 40, 60), np.float32)
     raw[0] = 2.0
@@ -222,7 +222,7 @@ def test_dropped_frames_and_seconds_stand_in_the_row():
     assert score(7, sequences.factorize_pair(now, before, raw), moving_px=1.0)["gap"] == 2
 
 
-def test_what_is_unknown_is_empty_in_the_row():
+def test_unknown_numbers_are_empty_cells():
     nothing = np.full((2, 40, 60), np.nan, np.float32)
     of_b = frame("c", raw=np.ones((2, 40, 60), np.float32), raw_since="b")  # not of a
     row = score(1, sequences.factorize_pair(frame("a"), of_b, nothing), moving_px=1.0)

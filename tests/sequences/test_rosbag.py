@@ -184,7 +184,7 @@ def test_transforms_in_a_circle_end(tmp_path):
 
 
 @pytest.mark.parametrize("kind", KINDS[:2])
-def test_without_the_static_transform_that_is_told_and_can_be_given(kind, tmp_path):
+def test_a_missing_static_transform_is_reported_and_can_be_given(kind, tmp_path):
     path, moments = write(kind, tmp_path, static=False)
     recording = open_recording(path, "rosbag")
     assert_is_read(recording, moments, poses=False)
@@ -256,7 +256,7 @@ def test_a_bag_that_was_cut_off_is_named(kind, tmp_path):
         list(open_recording(path, "rosbag"))
 
 
-def test_a_pipe_is_no_bag(tmp_path):
+def test_a_named_pipe_is_refused_as_a_bag(tmp_path):
     os.mkfifo(tmp_path / "in.bag")
     with pytest.raises(SequenceError, match="regular"):
         open_recording(tmp_path / "in.bag", "rosbag")

@@ -8,7 +8,7 @@ import pytest
 from flowrep.scenes import scene_names
 from flowrep.simulator.meshes import Body, Mesh, gather
 from flowrep.simulator.paint import AMBIENT, DIFFUSE, GRAIN_SIZE, LIGHT, PAINTS, grain, swatch
-from flowrep.simulator.rasteriser import Rasteriser, _find_texels
+from flowrep.simulator.rasteriser import Rasteriser
 
 ROAD, CAR, PEDESTRIAN = 1, 9, 4
 SHIRT = np.array(PAINTS["shirt_red"])
@@ -71,22 +71,6 @@ def test_the_grain_fades_where_a_pixel_covers_it():
     deviations = [seen_from_above(road, height_m=m).std(axis=(0, 1))[0] for m in (4, 40, 400)]
     assert deviations[0] > 15 > deviations[1] > deviations[2]
     assert deviations[2] <= 0.6  # a pixel is 10 m wide, the longest waves 4 m
-
-
-@pytest.mark.parametrize(("w_u", "w_v"), [(3e-3, 1e-3), (1e-3, -4e-3)])
-def test_the_level_is_a_pixels_size_on_a_slanted_surface(w_u, w_v):
-    axes = np.array([[900.0, 40.0, 300.0, 7.0], [60.0, 700.0, 200.0, 3.0]])
-
-    def row(down):  # three pixels of a plane 5 m away, whose inverse depth changes by w_u and w_v
-        us, vs, levels = texels = np.empty((3, 3), np.float32)
-        at = 0.1, 0.2 + 0.01 * down, 0.01, 0.01, 0.2 + w_v * down, w_u, w_v
-        _find_texels(3, axes, *at, False, us, vs, levels)
-        return texels
-
-    (above, middle, below) = map(row, (-1, 0, 1))
-    right = np.hypot(*(middle[:2, 2] - middle[:2, 0])) / 2
-    down = np.hypot(*(below[:2, 1] - above[:2, 1])) / 2
-    assert middle[2, 1] == pytest.approx(np.log2(max(right, down)), abs=0.06)
 
 
 def test_the_levels_of_the_grain_are_the_same_pattern_ever_coarser():

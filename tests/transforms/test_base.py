@@ -140,7 +140,7 @@ def test_values_are_checked_at_resets_of_their_own_rows_and_in_batches_but_not_i
         checks(td)
 
 
-def test_a_transform_made_wrong_is_told_what_is_wrong():
+def test_mistakes_in_a_subclass_of_map_transform_are_named():
     with pytest.raises(TypeError, match=r"MapTransform: reads are layouts.*DEPTH.*\['raw'\]"):
         T.base.MapTransform(["raw"], "raw", "out")
 
@@ -203,13 +203,13 @@ def test_poses_give_the_flow_between_two_observations_though_a_frame_lies_betwee
     torch.testing.assert_close(seen["ego"], want.flow, atol=1e-4, rtol=1e-4)
 
 
-def test_what_steps_the_env_at_a_reset_comes_before_what_compares_steps():
+def test_a_transform_that_steps_at_a_reset_is_refused_after_camera_motion():
     env = TransformedEnv(FakeSensorEnv(), Compose(*by_poses(), noop()))
     with pytest.raises(ValueError, match=r"NoopResetEnv.*CameraMotion.*put it first"):
         env.reset()
 
 
-def test_all_that_is_computed_from_a_first_frame_is_what_a_reset_would_give():
+def test_envs_that_reset_themselves_give_the_same_first_frames():
     depth, rgb = ("sensor", "depth"), ("sensor", "rgb")
 
     def rollout(env: FakeSensorEnv) -> TensorDict:

@@ -154,7 +154,7 @@ CHECKED = {
 
 
 @pytest.mark.parametrize(("transform", "given"), CHECKED.values(), ids=list(CHECKED))
-def test_what_checks_values_is_one_graph_too_and_runs_without_values(transform, given):
+def test_transforms_that_check_values_compile_to_one_graph(transform, given):
     (key,), given = transform.out_keys, TensorDict(x=given)
     compiled = torch.compile(transform, fullgraph=True, backend="eager")
     assert torch.equal(compiled(given.clone())[key], transform(given.clone())[key])

@@ -399,7 +399,7 @@ def test_safetensors_are_read_too(weights):
     assert T.RAFT(path)(pictures, pictures)[0, :, 0, 0].tolist() == [24.0, -12.0]
 
 
-def test_what_is_no_weights_is_refused_by_name(weights, tmp_path):
+def test_a_file_without_rafts_weights_is_refused_by_name(weights, tmp_path):
     for garbage in (tmp_path / "w.pth", tmp_path / "w.safetensors"):
         garbage.write_bytes(b"garbage")
         with pytest.raises(ValueError, match=f"'{garbage}' is not a readable weights file"):

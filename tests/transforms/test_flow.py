@@ -205,7 +205,7 @@ def test_raw_flow_that_would_be_scaled_twice_is_refused():
 
 
 @pytest.mark.parametrize("make", [RawFlow, FlowFactorize, EstimateCameraMotion])
-def test_a_camera_that_is_none_is_refused(make):
+def test_intrinsics_of_none_are_refused(make):
     with pytest.raises(TypeError, match="intrinsics is K"):
         make(None)
 
@@ -260,7 +260,7 @@ def test_drift_is_below_the_threshold_and_who_moves_above_it():
 
 
 @pytest.mark.parametrize("make", [RawFlow, FlowFactorize, partial(AdaptDepth, "ray_length")])
-def test_a_k_that_cannot_be_one_is_refused(make):
+def test_a_k_with_nan_and_a_transposed_k_are_refused(make):
     broken = torch.tensor(INTRINSICS)
     broken[0, 0] = math.nan
     for K in (broken, torch.tensor(INTRINSICS).T):  # transposed, it would count as cx = cy = 0

@@ -94,7 +94,7 @@ def test_n_step_returns_without_stored_stacks_are_refused():
     assert same_bits(sample["next", STACK], want)
 
 
-def test_what_lacks_the_step_before_is_refused():
+def test_a_frame_stack_without_its_previous_step_is_refused():
     td = FakeSensorEnv((2,)).rollout(4, break_when_any_done=False).reshape(-1)
     with pytest.raises(KeyError, match=r"'depth3' is not in the batch.*named 'time'"):
         stack_of_three()(td)
@@ -116,7 +116,7 @@ def normalised(key):
         (lambda: DTypeCastTransform(torch.float32, torch.float64, [STACK]), "writes to"),
     ],
 )
-def test_what_would_change_the_stack_for_the_next_step_is_refused(later, said):
+def test_a_transform_that_changes_a_carried_stack_is_refused(later, said):
     with pytest.raises(ValueError, match=said):
         TransformedEnv(FakeSensorEnv((), 1), Compose(stack_of_three(), later())).rollout(2)
     elsewhere = ObservationNorm(loc=0.0, scale=0.1, in_keys=[STACK], out_keys=["normal"])

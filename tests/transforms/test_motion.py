@@ -118,7 +118,7 @@ def test_no_body_gets_its_neighbours_motion():
             flow(ids=ids)
 
 
-def test_in_a_batch_too_whose_ids_are_counted_beside_it():
+def test_bodies_of_a_batch_are_counted_if_instance_ids_is_beside_the_flow():
     def flow(*bodies):
         td, ids = moments(2), InstanceIds(bodies, static_ids=[0, 2], in_keys="ids")
         return Compose(ids, RawFlow(INTRINSICS))(td.set("ids", td["sensor", "instance"]))["raw"]

@@ -88,5 +88,5 @@ def test_a_mistake_is_named(words, call):
         call()
 
 
-def test_what_needs_neither_k_nor_classes_is_made_without():
+def test_representations_without_flow_or_classes_need_no_k():
     assert T.representation_stack(["depth", "rgb"])

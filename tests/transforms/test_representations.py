@@ -52,7 +52,7 @@ def test_each_representation_writes_its_own_key_and_no_other(name):
     assert set(offline["next"].keys()) == set(td["next"].keys())
 
 
-def test_all_at_once_are_what_each_is_alone():
+def test_a_stack_of_all_representations_equals_each_alone():
     together = rollout(REPRESENTATIONS)
     for name in REPRESENTATIONS:
         assert torch.equal(together[name], rollout([name])[name])
@@ -120,7 +120,7 @@ def test_noise_is_in_what_depth_and_odometry_go_into_and_in_nothing_else():
         (["obj", "depth"], NOISE, ["depth", "prev_from_curr", "frame"]),
     ],
 )
-def test_only_what_is_read_and_wrong_is_drawn(names, noise, read):
+def test_noise_is_drawn_only_for_sensors_that_are_read_and_noisy(names, noise, read):
     first = stack(names, noise=noise)[0]
     if read is None:
         assert repr(stack(names, noise=noise)) == repr(stack(names))

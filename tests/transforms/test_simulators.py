@@ -409,7 +409,7 @@ def test_colours_are_not_taken_for_ids(simulator):
 
 
 @pytest.mark.parametrize(("simulator", "other"), [("mujoco", 6), ("mjlab", 9)])  # a site, a flex
-def test_what_is_no_geom_is_not_a_body_and_is_named(simulator, other):
+def test_sites_and_flexes_are_no_bodies_and_are_named(simulator, other):
     def with_marker(t):
         buffers = WRITERS[simulator](t)
         segmentation = buffers["segmentation"].copy()

@@ -73,14 +73,6 @@ def test_every_zone_of_a_path_has_its_name_at_its_place(layout):
         assert layout.zones[name.replace(" ", "_")].contains(Point(place))
 
 
-def test_a_zone_that_is_start_and_end_has_its_names_on_two_sides():
-    (axes,) = draw_plan(Layout(load_scene("s_turn"))).axes
-    offsets = {t.get_text(): t.xyann for t in axes.texts if t.get_text()}
-    # The western stretch runs along x: its start is named above it, its end below.
-    assert offsets["west"] == pytest.approx((0, 30), abs=1e-6)
-    assert offsets["west end"] == pytest.approx((0, -30), abs=1e-6)
-
-
 def test_a_plan_of_a_path_shows_only_the_closures_of_that_path(layout):
     def closed(path):
         patches = draw_plan(layout, path=path).axes[0].patches
