@@ -5,20 +5,28 @@ point that p shows was seen at the projection of R x + q T. The residual is this
 the position p' that raw flow gives, in pixels. Sky has q = 0, so it constrains the rotation alone
 and needs no special case.
 
-Moving bodies are outliers, so the motion is estimated in three stages:
+Moving bodies are outliers, so the motion is estimated in three stages (`_estimated`):
 
 1. Many hypotheses, each computed from four pixels (RANSAC), are scored on a few hundred pixels by
-   a truncated cost. The best few are refined and scored again (`_best_hypothesis`).
-2. A few hundred pixels can't distinguish 49 % from 51 %. A second candidate is therefore the motion
-   of the pixels that the best hypothesis doesn't explain, and all pixels choose between the two.
-3. Gauss-Newton steps on more pixels refine the choice, with Geman-McClure weights whose scale
-   follows the residuals (`_descended`). `_described` computes the covariance of the result.
+   a truncated cost. The best few are refined and scored again.
+2. A few hundred pixels can't distinguish 49 % from 51 %. A second candidate is therefore the best
+   hypothesis for what the first doesn't explain of other pixels. Both are refined on more pixels,
+   and all pixels choose between the two.
+3. A last step refines the choice in float64. `_described` computes the covariance of the result.
+
+Refining is by Gauss-Newton steps with Geman-McClure weights whose scale follows the residuals
+(`_descended`).
+
+For a single frame, the number of PyTorch's calls decides the time. All is therefore in pixels of
+the previous picture, relative to its principal point: with F the previous K without that point, a
+ray (x, y, 1, q) is multiplied by F and a motion M becomes F M F^-1, and projecting is a division.
+Where flow is unknown, the target of the residual is so far away that the pixel has no weight; no
+mask is needed.
 
 Pixels are used in a pseudo-random order, which is fixed for a picture size. In a regular order,
 such as every tenth column, a body that fills those columns would win.
 
-Shapes: B is the number of frames, N of pixels, M of motions. Values of pixels are `[B, channels,
-N]`, so that the sums over pixels in the normal equations are matrix products.
+Shapes: B is the number of frames, M of motions of each frame, N of pixels.
 """
 
 from __future__ import annotations
@@ -26,7 +34,7 @@ from __future__ import annotations
 import functools
 import math
 import random
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -43,21 +51,21 @@ SCORED_PIXELS = 320  # pixels that score a hypothesis
 # draw in 16 has only static pixels: all 64 draws fail with a probability of 0.94^64 = 2 %.
 HYPOTHESES, PIXELS_EACH = 64, 4
 MIN_PIXELS = 32  # known pixels below which there is no motion: any motion fits four of them
-_HYPOTHESIS_STEPS, _STEPS = 3, 4  # Gauss-Newton steps of a hypothesis, and of the final motion
+_HYPOTHESIS_STEPS = 2  # Gauss-Newton steps of a hypothesis, from the expected motion
 
-# The pixels of each hypothesis, as shares of the number of known pixels. They are drawn only once,
-# so that a frame has the same motion in every batch, process and replay.
+# The pixels of each hypothesis and those that score, as shares of the number of known pixels. They
+# are drawn only once, so that a frame has the same motion in every batch, process and replay.
 _random = random.Random(0)
-_DRAWS = [[_random.random() for _ in range(PIXELS_EACH)] for _ in range(HYPOTHESES)]
+_SHARES = [_random.random() for _ in range(HYPOTHESES * PIXELS_EACH)]
+_SHARES += [(i + shift) / SCORED_PIXELS for shift in (0.0, 0.5) for i in range(SCORED_PIXELS)]
+_SHARES += [i / PIXELS for i in range(PIXELS)]
 
 # The residual at which a pixel's cost is half of its bound. The least is for exact flow, whose
 # residuals are only rounding errors, which can't rank motions.
 _SCORE_SCALES = 1.5  # in standard deviations
 _LEAST_SCORE_PX = 0.02
 _PRIORS_FAVOUR = 1.5  # the prior wins against a body on up to 3/5 of the pixels, 1.5 times the rest
-_REFINED = 6  # how many of the best hypotheses are refined
-_REFINING_STEPS = 2  # Gauss-Newton steps of each of them
-_RIVAL_STEPS = 3  # Gauss-Newton steps of the second candidate
+_REFINED = 5  # how many of the best hypotheses are refined
 _INLIER_SCALES = 2.5  # in standard deviations; 96 % of normal errors in two channels are within
 _STILL_PX = 0.2  # flow with residuals up to this standard deviation may be that of a still camera
 _LEAST_STRENGTH = 0.1  # least mean square of a motion's flow, relative to that of the residuals
@@ -65,8 +73,9 @@ _LEAST_OVER_CHANCE = 16  # least strength, relative to that of a motion fitted t
 _LEAST_SCALE_PX = 2e-3  # far above the rounding of exact float32 flow, far below any measured flow
 _SCALES = 1.5  # standard deviations at which the weight of a pixel is a quarter
 _QUANTILE = 1 / 3  # of residuals, which gives their scale; half of the pixels may be outliers
-# The same quantile of the length of a vector with two standard normal components.
-_RAYLEIGH = math.sqrt(-2 * math.log(1 - _QUANTILE))
+# The same quantile of the square of a vector with two standard normal components.
+_RAYLEIGH_SQUARE = -2 * math.log(1 - _QUANTILE)
+_FAR = 1e18  # px, the target of a pixel without known flow; its square is finite in float32
 
 # For flow that is estimated from pictures.
 _WINDOW = 3  # side of the structure tensor's window, pixels
@@ -92,31 +101,12 @@ class MotionEstimate(NamedTuple):
 
 
 class _Samples(NamedTuple):
-    """N pixels of each of B frames; `number` of them are known."""
+    """N pixels of each of B frames."""
 
-    focal: Tensor  # fx, skew, fy of the previous camera: [B, 3]
-    values: Tensor  # [B, 6 or 9, N]: ray (x, y, 1) and q; flow (u, v); structure (xx, xy, yy)
-    known: Tensor  # [B, N], bool
-    number: Tensor  # [B], of known pixels
-
-    def part(self, index: Tensor) -> _Samples:
-        """Returns the pixels at `index` `[B, M, N]` as samples of B * M frames."""
-        at = index.flatten(1)
-        values = self.values.gather(-1, at.unsqueeze(1).expand(-1, self.values.shape[1], -1))
-        values = values.unflatten(-1, index.shape[1:]).movedim(-2, 1).flatten(0, 1)
-        known = self.known.gather(-1, at).reshape(-1, index.shape[-1])
-        focal, number = (x.repeat_interleave(index.shape[1], 0) for x in (self.focal, self.number))
-        return _Samples(focal, values, known, number)
-
-    def every_few(self, count: int, shift: float) -> _Samples:
-        """Returns `count` known pixels of each frame, evenly spaced in their (random) order."""
-        shares = (torch.arange(count, device=self.number.device) + shift) / count
-        return self.part((shares * self.number.unsqueeze(-1)).long().unsqueeze(1))
-
-    def in_pixels(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Converts shifts of rays at z = 1, `[B, ..., N]`, to pixels in the picture."""
-        fx, skew, fy = self.focal.to(x.dtype).reshape(-1, 3, *[1] * (x.ndim - 1)).unbind(1)
-        return fx * x + skew * y, fy * y
+    ray: Tensor  # [B, 4, N], (x, y, 1, q)
+    target: Tensor  # [B, 1, 2, N], where flow says that the point was, or `_FAR`
+    root: tuple[Tensor, Tensor] | None  # of the structure: diagonal [B, 1, 2, N], rest [B, 1, 1, N]
+    twists: Tensor  # [B, 6, 4, 4], derivatives of a motion by a small one after it
 
 
 @torch.no_grad()
@@ -200,7 +190,7 @@ def camera_motion(
         return tensor.to(to).expand(*batch, *size).reshape(-1, *size)
 
     K_now, _, known = known_camera(flat(K, 2, torch.float64), 1.0)
-    K_before = K_now
+    K_before = None
     if prev_K is not None:
         K_before, _, known_before = known_camera(flat(prev_K, 2, torch.float64), 1.0)
         known = known & known_before
@@ -210,11 +200,12 @@ def camera_motion(
         has_prior = (prior.abs() <= LARGEST).flatten(1).all(-1)  # nan compares False
         expected, known = torch.where(has_prior[:, None, None], prior, expected), known & has_prior
     structure = None if picture is None else structure_tensor(flat(picture, 3))
-    voters = _voters(flat(flow, 3), flat(depth, 3), K_now, K_before, structure, known)
-    samples = _samples(voters)
-    motion = _best_hypothesis(voters, samples, expected, has_prior=prior is not None)
-    motion = _descended(samples, motion, _STEPS)
-    share, covariance, valid = _described(samples, motion)
+    values, is_known = _voters(flat(flow, 3), flat(depth, 3), K_now, K_before, structure, known)
+    K_before = K_now if K_before is None else K_before
+    samples, in_pixels, motion, number = _estimated(
+        values, is_known, K_before, None if prior is None else expected
+    )
+    share, covariance, valid = _described(samples, in_pixels, number)
     motion = torch.where(valid[:, None, None], motion, expected)
     motion, share, covariance, valid = (
         part.reshape((*batch, *part.shape[1:])) for part in (motion, share, covariance, valid)
@@ -233,16 +224,12 @@ def motion_of_points(
     `[B, N]`.
     """
     known = known & flow.isfinite().all(1) & inverse_depth.isfinite()
-    order = (~known).long().argsort(dim=-1, stable=True)
-    values = torch.cat([rays, inverse_depth.unsqueeze(1), flow], 1).double()
-    values = torch.where(known.unsqueeze(1), values, 1.0)
-    values = values.gather(-1, order.unsqueeze(1).expand_as(values))
-    samples = _Samples(
-        K[:, [0, 0, 1], [0, 1, 1]].double(), values, known.gather(-1, order), known.sum(-1)
-    )
-    start = torch.eye(4, dtype=torch.float64, device=K.device).expand(len(K), 4, 4)
-    motion = _best_hypothesis(samples, samples, start, has_prior=False)
-    return _descended(samples, motion, _STEPS)
+    K = K.double()
+    xy = torch.bmm(K[:, :2, :2], rays[:, :2].double())
+    rest = torch.stack([torch.ones_like(inverse_depth), inverse_depth], 1)
+    values = torch.cat([xy, rest, xy - flow], 1)
+    # One more point, which is unknown, for where there are none.
+    return _estimated(functional.pad(values, (0, 1)), functional.pad(known, (0, 1)), K, None)[2]
 
 
 def structure_tensor(picture: Tensor) -> Tensor:
@@ -268,322 +255,326 @@ def structure_tensor(picture: Tensor) -> Tensor:
 
 @functools.lru_cache(maxsize=16)
 def _shuffled(height: int, width: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Returns the indices of up to `VOTERS` pixels in random order, and their centres `[2, N]`."""
+    """Returns the indices of up to `VOTERS` pixels in random order, and centres `[2, N + 1]`."""
     bits = (1 << 32) - 1
     key = torch.arange(height * width, device=device)
     for _ in range(2):  # a hash that is one to one on 32 bits: keys differ, so the order is fixed
         key = ((key ^ (key >> 16)) * 0x45D9F3B) & bits
     pixel = (key ^ (key >> 16)).argsort()[:VOTERS]
-    return pixel, torch.stack([pixel % width, pixel // width]) + 0.5
+    return pixel, functional.pad(torch.stack([pixel % width, pixel // width]) + 0.5, (0, 1))
+
+
+@functools.lru_cache(maxsize=16)
+def _constants(device: torch.device) -> tuple[Tensor, ...]:
+    """Returns shares of drawn pixels, six twists `[4, 24]`, an unknown pixel, two 4 x 4 matrices.
+
+    A twist is the derivative of a motion by one of its rotations or translations; the matrices have
+    ones where F has its focal lengths, and on the diagonal.
+    """
+    twists = torch.zeros(4, 6, 4, dtype=torch.float64)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        twists[k, i, j], twists[j, i, k], twists[i, 3 + i, 3] = 1.0, -1.0, 1.0
+    unknown = torch.tensor([0.0, 0.0, 1.0, 0.0, _FAR, _FAR, 1.0, 1.0, 0.0]).unsqueeze(-1)
+    shares = torch.tensor(_SHARES, dtype=torch.float64)
+    of_focal = torch.tensor([[1.0, 1, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]])
+    still = torch.eye(4, dtype=torch.float64)
+    constants = (shares, twists.flatten(1), unknown, of_focal.double(), still)
+    return tuple(constant.to(device) for constant in constants)
+
+
+@functools.lru_cache(maxsize=16)
+def _damping(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns a factor and a summand of normal matrices `[6, 6]`, and the identity `[4, 4]`.
+
+    They raise the diagonal a little above rounding errors, so that no step is taken in a direction
+    that pixels don't determine.
+    """
+    each = torch.eye(6, dtype=dtype)
+    share = 1e-6 if dtype is torch.float32 else 1e-9
+    still = torch.eye(4, dtype=dtype)
+    return (1 + share * each).to(device), (1e-30 * each).to(device), still.to(device)
+
+
+def _cached(function: Any, *args: Any) -> Any:
+    """Returns a cached function's result, computed anew within a graph that is compiled."""
+    return (function.__wrapped__ if torch.compiler.is_compiling() else function)(*args)
 
 
 def _voters(
     flow: Tensor,
     depth: Tensor,
     K: Tensor,
-    prev_K: Tensor,
+    prev_K: Tensor | None,
     structure: Tensor | None,
     known_frame: Tensor,
-) -> _Samples:
-    """Returns up to `VOTERS` pixels of each frame in random order.
+) -> tuple[Tensor, Tensor]:
+    """Returns the values of up to `VOTERS` pixels of each frame, and which are known.
 
-    The part of their flow that a change of K causes is removed. Where `known_frame` `[B]` is False,
-    no pixel is known.
+    Values are `[B, 6 or 9, 1 + N]`: ray, target and, with a structure, its root; the last pixel
+    is unknown. Where `known_frame` `[B]` is False, no pixel is known.
     """
-    shuffled = _shuffled.__wrapped__ if torch.compiler.is_compiling() else _shuffled
-    pixel, centres = shuffled(*flow.shape[-2:], flow.device)
-    column, row = centres.to(flow.dtype)
-    maps = [flow, depth] if structure is None else [flow, depth, structure]
+    pixel, centres = _cached(_shuffled, *flow.shape[-2:], flow.device)
+    maps = torch.cat([flow, depth, *([] if structure is None else [structure])], 1)
     # gather, because indexing takes five times as long.
-    each = (m.flatten(-2).gather(-1, pixel.expand(*m.shape[:2], -1)) for m in maps)
-    values = torch.cat([*each], 1)  # [B, 3 or 6, N]
-    u, v, z = values[:, :3].unbind(1)
-    known = u.isfinite() & v.isfinite() & (z >= LEAST_POSITIVE)  # nan compares False
+    maps = maps.flatten(2).gather(2, pixel.expand(*maps.shape[:2], -1))
+    maps = functional.pad(maps, (0, 1), value=math.nan)
+    flow, depth, structure = maps[:, :2], maps[:, 2:3], maps[:, 3:]
+    known = (flow.abs().amax(1) <= LARGEST) & (depth[:, 0] >= LEAST_POSITIVE)  # not where nan
     known &= known_frame.unsqueeze(-1)
-    if structure is not None:
-        known &= values[:, 3] + values[:, 5] > _LEAST_TEXTURE
-    (fx, skew, cx), (_, fy, cy), _ = _entries(K, values.dtype)
-    y = (row - cy) / fy
-    x = (column - cx - skew * y) / fx
-    # If the previous K was different, a pixel moves although its ray does not; add that part back.
-    (fx, skew, cx), (_, fy, cy), _ = _entries(prev_K - K, values.dtype)
-    moved = values[:, :2] + torch.stack([fx * x + skew * y + cx, fy * y + cy], 1)
-    ray = torch.stack([x, y, torch.ones_like(x), values[:, 2].reciprocal()], 1)
-    focal = prev_K[:, [0, 0, 1], [0, 1, 1]]
-    values = torch.cat([ray, moved, values[:, 3:]], 1)
-    return _Samples(focal, values, known, known.sum(-1))
+    xy = before = (centres - K[:, :2, 2:]).to(flow.dtype)
+    if prev_K is not None:  # a pixel moves although its ray does not
+        change = torch.bmm(prev_K - K, torch.linalg.inv_ex(K)[0])[:, :2, :2]
+        before = (centres - prev_K[:, :2, 2:]).to(flow.dtype)
+        xy = xy + torch.bmm(change.to(flow.dtype), xy)
+    values = [xy, torch.ones_like(depth), depth.reciprocal(), before - flow]
+    if structure.shape[1]:
+        xx, xy, yy = structure.unbind(1)
+        known &= xx + yy > _LEAST_TEXTURE
+        # The root of a symmetric 2 x 2 matrix: (S + sqrt(det S)) / sqrt(trace S + 2 sqrt(det S)).
+        root = (xx * yy - xy * xy).clamp(min=0.0).sqrt()
+        rows = torch.stack([xx + root, yy + root, xy], 1)
+        values.append(rows * (xx + yy + 2 * root).rsqrt().unsqueeze(1))
+    return torch.cat(values, 1), known
 
 
-def _samples(voters: _Samples) -> _Samples:
-    """Returns the first `PIXELS` known pixels of each frame, filled up with unknown ones."""
-    batch, looked_at = voters.known.shape
-    # Compact without a loop or a sort: write each known pixel to the slot of its rank among the
-    # known ones, and all others to a slot beyond the end, which is cut off.
-    rank = voters.known.long().cumsum(-1) - 1
-    slot = torch.where(voters.known & (rank < PIXELS), rank, PIXELS)
-    order = torch.zeros(batch, PIXELS + 1, dtype=torch.long, device=slot.device)
-    order.scatter_(1, slot, torch.arange(looked_at, device=slot.device).expand(batch, -1))
-    number = voters.number.clamp(max=PIXELS)
-    known = torch.arange(PIXELS, device=slot.device) < number.unsqueeze(-1)
-    chosen = voters.part(order[:, None, :PIXELS])
-    values = torch.where(known.unsqueeze(1), chosen.values, 1.0)  # nan · 0 would stay nan
-    return chosen._replace(values=values, known=known, number=number)
+def _samples_of(values: Tensor, twists: Tensor) -> _Samples:
+    """Returns samples from their values, see `_voters`."""
+    ray, target, *root = values.split([4, 2, 2, 1] if values.shape[1] > 6 else [4, 2], 1)
+    pair = (root[0].unsqueeze(1), root[1].unsqueeze(1)) if root else None
+    return _Samples(ray, target.unsqueeze(1), pair, twists)
 
 
-def _entries(K: Tensor, dtype: torch.dtype) -> list[list[Tensor]]:
-    """Returns the rows of K `[B, 3, 3]`, `[B, 1]` each."""
-    return [list(row.unbind(-1)) for row in K.to(dtype).unsqueeze(1).unbind(-2)]
+def _structured(samples: _Samples, shifts: Tensor) -> Tensor:
+    """Returns shifts in the picture `[B, ..., 2, N]` times the root of the structure, if given.
+
+    The squared length of a residual r is then r^T S r.
+    """
+    if samples.root is None:
+        return shifts
+    diagonal, rest = samples.root
+    return torch.addcmul(diagonal * shifts, rest, shifts.flip(-2))
 
 
-def _best_hypothesis(
-    voters: _Samples, samples: _Samples, expected: Tensor, *, has_prior: bool
-) -> Tensor:
-    """Returns the best of the expected motion and the hypotheses from four pixels, `[B, 4, 4]`."""
-    batch = len(expected)
+def _estimated(
+    values: Tensor, known: Tensor, K: Tensor, expected: Tensor | None
+) -> tuple[_Samples, Tensor, Tensor, Tensor]:
+    """Returns samples, their motion in pixels and in metres, and the number of known pixels.
+
+    Args:
+        values: `[B, 6 or 9, 1 + N]`, see `_voters`.
+        known: `[B, 1 + N]`, bool.
+        K: of the previous frame, `[B, 3, 3]`, float64.
+        expected: the prior `[B, 4, 4]`; the identity by default.
+    """
+    batch = len(values)
+    shares, twists, unknown, of_focal, still = _cached(_constants, values.device)
+    F = torch.where(of_focal > 0, functional.pad(K, (0, 1, 0, 1)), still)
+    inverse = torch.linalg.inv_ex(F)[0]
+    twists = torch.bmm(torch.bmm(F, twists.expand(batch, 4, 24)).view(batch, 24, 4), inverse)
+    twists = twists.view(batch, 4, 6, 4).movedim(2, 1).contiguous()
+    values = torch.where(known.unsqueeze(1), values, unknown[: values.shape[1]].to(values.dtype))
+    # The k-th known pixel is the first with k known ones up to it. Fewer known ones than are needed
+    # are repeated; if there is none, it is the last pixel, which is unknown.
+    count = known.cumsum(-1)
+    number = count[:, -1:]
+    index = torch.searchsorted(count, (shares * number.clamp(max=PIXELS)).long() + 1)
+    index = index.clamp(max=known.shape[-1] - 1).unsqueeze(1).expand(-1, values.shape[1], -1)
+    sizes = [HYPOTHESES * PIXELS_EACH, SCORED_PIXELS, SCORED_PIXELS, PIXELS]
+    drawn, scored, others, samples = values.gather(-1, index).split(sizes, -1)
     # All H hypotheses of all frames at once, as B * H frames of four pixels. In float64, because
     # the normal equations of four pixels in a row are nearly singular.
-    draws = torch.tensor(_DRAWS, dtype=torch.float64, device=expected.device)
-    drawn = samples.part((draws * samples.number[:, None, None]).long())  # [B, H, 4]
-    each = _Samples(drawn.focal, drawn.values.double(), drawn.known, drawn.number)
-    motion = expected.repeat_interleave(HYPOTHESES, 0)
-    for _ in range(_HYPOTHESIS_STEPS):
-        at = _linearised(each, motion)
-        normal, right = _normal_equations(each, at, at.in_front.double())
-        # Damped relative to each diagonal element and to the largest one, so that the motion
-        # doesn't change in a direction that the four pixels don't determine.
-        diagonal = normal.diagonal(dim1=-2, dim2=-1)
-        damping = 1e-9 * diagonal + 1e-12 * diagonal.amax(-1, keepdim=True) + 1e-30
-        step = torch.linalg.solve_ex(normal + torch.diag_embed(damping), right)[0]
-        step = torch.where(step.isfinite().all(-1, keepdim=True), step, 0.0).clamp(-10.0, 10.0)
-        motion = _after(motion, -step)
-    scored, others = (samples.every_few(SCORED_PIXELS, shift) for shift in (0.0, 0.5))
-    first = _descended(scored, expected, _STEPS) if has_prior else expected
-    motions = torch.cat([first.unsqueeze(1), motion.unflatten(0, (batch, HYPOTHESES))], 1)
-    # Factors on the (negative) costs: the expected motion wins exact ties, a prior also near ties.
-    favour = torch.ones(1 + HYPOTHESES, device=expected.device)
-    favour[0] = _PRIORS_FAVOUR if has_prior else 1 + 1e-6
-    # Similar costs may lead to different optima, so the best hypotheses are refined and scored
-    # again.
-    best = (_costs(scored, motions)[0] * favour).topk(_REFINED, largest=False).indices
-    motions = motions.gather(1, best[..., None, None].expand(-1, -1, 4, 4)).flatten(0, 1)
-    repeated = _Samples(*(part.repeat_interleave(_REFINED, 0) for part in scored))
-    motions = _descended(repeated, motions, _REFINING_STEPS).unflatten(0, (batch, _REFINED))
-    costs, scale = _costs(scored, motions, final=True)
-    choice = (costs * favour[best]).argmin(-1, keepdim=True)
-    motion = motions.gather(1, choice[..., None, None].expand(-1, -1, 4, 4)).squeeze(1)
-    # The pixels that it doesn't explain may be the static world, which happened to have too few of
-    # the scored pixels. The second candidate therefore comes from other pixels.
-    ru, rv, in_front, *_ = _residuals(others, motion)
-    is_rest = _squared(others, ru, rv) > (_INLIER_SCALES * scale).square().unsqueeze(-1)
-    unexplained = others._replace(known=others.known & in_front & is_rest)
-    rival = _descended(unexplained, motion, _RIVAL_STEPS)
-    finalists = torch.stack([motion, rival, *([first] if has_prior else [])], 1)
-    costs, _ = _costs(voters, finalists, final=True)
-    if has_prior:
-        costs[:, 2] *= _PRIORS_FAVOUR
-    return finalists[torch.arange(batch, device=expected.device), costs.argmin(-1)]
-
-
-def _costs(samples: _Samples, motions: Tensor, *, final: bool = False) -> tuple[Tensor, Tensor]:
-    """Returns costs per pixel `[B, M]`, -1 to 0, of motions `[B, M, 4, 4]`, and the scale `[B]`.
-
-    The final choice is between optimised motions. A compromise between the motions of two bodies,
-    which explains both by half, must not win against the motion of one; squaring prevents that.
-    """
-    ru, rv, in_front, *_ = _residuals(samples, motions)
-    known = in_front & samples.known.unsqueeze(1)
-    squared = torch.where(known, _squared(samples, ru, rv), torch.inf)
-    number = samples.known.sum(-1, keepdim=True)
+    drawn = drawn.double().unflatten(-1, (HYPOTHESES, -1)).movedim(2, 1).flatten(0, 1)
+    start = still.expand(batch, 4, 4)
+    if expected is not None:
+        start = still + torch.bmm(torch.bmm(F, expected - still), inverse)
+    each = _samples_of(drawn, twists.repeat_interleave(HYPOTHESES, 0))
+    motions = _descended(
+        each, start.repeat_interleave(HYPOTHESES, 0).unsqueeze(1), _HYPOTHESIS_STEPS, robust=False
+    )
+    single = twists.to(values.dtype)
+    scored, others = _samples_of(scored, single), _samples_of(others, single)
+    motions = motions.view(batch, HYPOTHESES, 4, 4).to(values.dtype)
+    *_, squared = _residuals(scored, motions, HYPOTHESES)
     # The scale is that of the residuals of the motion that fits best.
-    scale = _scale(squared, number).amin(-1) * (1.0 if final else _SCORE_SCALES)
-    scale = scale.clamp(min=_LEAST_SCORE_PX)
-    # Geman-McClure's 1 - r² / (s² + r²): 1 if a pixel has no residual, and 0 if it is not
-    # explained.
-    kept = (1 + squared / scale.square()[:, None, None]).reciprocal()
-    return -(kept.square() if final else kept).sum(-1) / number.clamp(min=1), scale
+    scale = _variance(squared, _SCORE_SCALES).amin(1, keepdim=True).clamp(min=_LEAST_SCORE_PX**2)
+    # Similar costs may lead to different optima, so the best hypotheses are refined and scored
+    # again, beside the expected motion, which wins exact ties (argmax returns the first) and, as a
+    # prior, near ties.
+    frames = torch.arange(batch, device=F.device).unsqueeze(-1)
+    best = _kept(squared, scale).sum(-1).topk(_REFINED).indices
+    refined = torch.cat([start.to(values.dtype).unsqueeze(1), motions[frames, best]], 1)
+    refined = _descended(scored, refined, 1)
+    *_, squared = _residuals(scored, refined, 1 + _REFINED)
+    final_scale = _variance(squared).amin(1, keepdim=True).clamp(min=_LEAST_SCORE_PX**2)
+    favour = 1.0 if expected is None else _PRIORS_FAVOUR
+    choice = _votes(squared, final_scale, favour).argmax(-1, keepdim=True)
+    # What it doesn't explain may be the static world, which happened to have too few of the scored
+    # pixels. The second candidate is the best hypothesis for that, of other pixels.
+    motions = torch.cat([refined[frames, choice], motions], 1)
+    *_, squared = _residuals(others, motions, 1 + HYPOTHESES)
+    left = squared[:, :1] > _INLIER_SCALES**2 * final_scale
+    rival = torch.bmm(_kept(squared, scale), left.to(squared.dtype).mT).argmax(1)
+    finalists = torch.cat([motions[:, :1], motions[frames, rival]], 1)
+    if expected is not None:
+        finalists = torch.cat([refined[:, :1], finalists], 1)
+    finalists = _descended(_samples_of(samples, single), finalists, 1, fast_steps=1)
+    *_, squared = _residuals(_samples_of(values, single), finalists, finalists.shape[1])
+    motion = finalists[frames, _votes(squared, final_scale, favour).argmax(-1, keepdim=True)]
+    # In float64: exact flow then leads to a motion that is exact in float32.
+    samples = _samples_of(samples.double(), twists)
+    motion = _descended(samples, motion.double(), 0, fast_steps=1).squeeze(1)
+    metric = still + torch.bmm(torch.bmm(inverse, motion - still), F)
+    return samples, motion, metric, number.squeeze(-1)
 
 
-def _residuals(samples: _Samples, motion: Tensor) -> tuple[Tensor, ...]:
-    """Returns residuals in px, whether points were in front of the camera, and how they moved.
+def _kept(squared: Tensor, scale: Tensor) -> Tensor:
+    """Returns Geman-McClure's 1 - r² / (s² + r²): 1 without a residual, 0 if far from explained."""
+    return (scale / (scale + squared)).nan_to_num(0.0)
 
-    `motion` is `[B, 4, 4]`, or `[B, M, 4, 4]` for M motions of each frame. The results are
-    `[B, (M,) N]`: residuals u and v, in front, the shifts of x / z and y / z, and the ratio of the
-    current z to the previous z.
+
+def _votes(squared: Tensor, scale: Tensor, favour: float) -> Tensor:
+    """Returns how much of the pixels motions explain `[B, M]`; the first's times `favour`.
+
+    The choice is between optimised motions. A compromise between the motions of two bodies, which
+    explains both by half, must not win against the motion of one; squaring prevents that.
     """
-    ray = samples.values[:, :4]
-    # The motion minus the identity, as in `closed_form`: shifts are exactly 0 without motion, and
-    # rounding errors are smaller.
-    still = torch.eye(3, 4, dtype=motion.dtype, device=motion.device)
-    moved = (motion[..., :3, :] - still).to(ray.dtype)
-    moved = (moved.flatten(1, -2) @ ray).unflatten(1, moved.shape[1:-1])  # [B, (M,) 3, N]
-    dx, dy, dz = moved.unbind(-2)
-    z_ratio = 1 + dz
-    in_front = z_ratio > MIN_DEPTH_RATIO
-    per_z = torch.where(in_front, z_ratio, 1.0).reciprocal()
-    per_frame = samples.values if motion.ndim == 3 else samples.values.unsqueeze(2)
-    x, y, u, v = (per_frame[:, channel] for channel in (0, 1, 4, 5))
-    dn, dm = (dx - x * dz) * per_z, (dy - y * dz) * per_z
-    du, dv = samples.in_pixels(dn, dm)
-    return du + u, dv + v, in_front, dn, dm, per_z
+    votes = _kept(squared, scale).square().sum(-1)
+    if favour != 1.0:
+        votes[:, 0] *= favour
+    return votes
 
 
-def _squared(samples: _Samples, ru: Tensor, rv: Tensor) -> Tensor:
-    """Returns the squared lengths of residuals, weighted by the structure (r^T S r)."""
-    structure = samples.values[:, 6:].unbind(1)
-    if not structure:
-        return ru * ru + rv * rv
-    xx, xy, yy = (s if ru.ndim == 2 else s.unsqueeze(1) for s in structure)
-    return (xx * ru * ru + 2 * xy * ru * rv + yy * rv * rv).clamp(min=0.0)
+def _residuals(
+    samples: _Samples, motion: Tensor, count: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Returns points and residuals of `count` = M motions, `[B, M, 4, 4]` or `[B M, 4, 4]`.
+
+    The points are (x, y, 1, q) in the previous camera, `[B, M, 4, N]`. After them come their first
+    two components, the residuals `[B, M, 2, N]`, px, and the squares of these `[B, M, N]`. A point
+    behind the camera is projected as if it were just before it, and so far away.
+    """
+    rows = motion.reshape(len(samples.ray), 4 * count, 4)
+    points = torch.bmm(rows, samples.ray).unflatten(1, (count, 4))
+    points = points / points[:, :, 2:3].clamp(min=MIN_DEPTH_RATIO)
+    seen_at = points[:, :, :2]
+    residual = _structured(samples, seen_at - samples.target)
+    return points, seen_at, residual, (residual * residual).sum(2)
 
 
-def _scale(squared: Tensor, number: Tensor) -> Tensor:
-    """Returns a robust standard deviation per channel, px, from squared residuals `[..., N]`."""
-    every = max(4, squared.shape[-1] // 384)  # 384 values give a good quantile and are sorted fast
-    squared = squared[..., ::every]  # unknown ones are inf, so they are sorted to the end
-    rank = (number * (_QUANTILE / every)).long().unsqueeze(-1).expand(*squared.shape[:-1], 1)
-    return squared.sort(-1).values.gather(-1, rank).squeeze(-1).sqrt() / _RAYLEIGH
+def _variance(squared: Tensor, scales: float = 1.0) -> Tensor:
+    """Returns the square of `scales` robust standard deviations per channel, `[B, M, 1]`, px²."""
+    few = squared[..., :: max(4, squared.shape[-1] // 384)]  # 384 values give a good quantile
+    rank = 1 + int(few.shape[-1] * _QUANTILE)
+    return few.kthvalue(rank, -1, keepdim=True).values * (scales**2 / _RAYLEIGH_SQUARE)
 
 
 class _Linear(NamedTuple):
-    """The residuals of a motion `[B, N]`, px, and their derivatives by a small motion after it."""
+    """Motions' residuals and their derivatives by a small motion after each of them."""
 
-    ru: Tensor
-    rv: Tensor
-    in_front: Tensor
-    Ju: Tensor  # [B, 6, N], by rotation vector and translation
-    Jv: Tensor
-
-
-def _linearised(samples: _Samples, motion: Tensor) -> _Linear:
-    # In the previous camera's coordinates, a small rotation w and translation t after the motion
-    # shift the point P = (n, m, 1) / q by w × P + t. The rows are the derivatives of n = x / z and
-    # m = y / z by the three components of w, then by those of t.
-    ru, rv, in_front, dn, dm, per_z = _residuals(samples, motion)
-    n, m = samples.values[:, 0] + dn, samples.values[:, 1] + dm
-    q = samples.values[:, 3] * per_z
-    zero, nm = torch.zeros_like(n), n * m
-    dn = torch.stack([-nm, 1 + n * n, -m, q, zero, -n * q], 1)
-    dm = torch.stack([-1 - m * m, nm, n, zero, q, -m * q], 1)
-    return _Linear(ru, rv, in_front, *samples.in_pixels(dn, dm))
+    residual: Tensor  # [B, M, 2, N], px
+    squared: Tensor  # [B, M, N], px²
+    J: Tensor  # [B M, 6, 2, N], by rotation vector and translation
+    plain: Tensor  # the same without the structure
 
 
-def _normal_equations(samples: _Samples, at: _Linear, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns J^T W J `[B, 6, 6]` and J^T W r `[B, 6]`, float64, for weights `[B, N]`."""
-    weight, structure = weight.unsqueeze(1), samples.values[:, 6:]
-    if structure.shape[1] == 0:
-        Wu, Wv = weight * at.Ju, weight * at.Jv
-    else:
-        xx, xy, yy = (weight * structure).unsqueeze(2).unbind(1)
-        Wu, Wv = xx * at.Ju + xy * at.Jv, xy * at.Ju + yy * at.Jv
-    normal = Wu @ at.Ju.mT + Wv @ at.Jv.mT
-    right = Wu @ at.ru.unsqueeze(-1) + Wv @ at.rv.unsqueeze(-1)
-    return normal.double(), right.squeeze(-1).double()
+def _linearised(samples: _Samples, motion: Tensor, count: int = 1) -> _Linear:
+    """Returns the residuals of `count` = M motions of each frame, with twists of all B M."""
+    points, seen_at, residual, squared = _residuals(samples, motion, count)
+    # A small motion X shifts the point P = (n, m, 1, q) by X P, and n by the first row of X P minus
+    # n times the third.
+    moved = torch.bmm(samples.twists.flatten(1, 2), points.flatten(0, 1)).unflatten(1, (6, 4))
+    across, along, _ = moved.split([2, 1, 1], 2)
+    seen_at = seen_at.reshape(len(moved), 1, *seen_at.shape[2:])
+    J = plain = torch.addcmul(across, along, seen_at, value=-1.0)
+    if samples.root is not None:
+        J = _structured(samples, J.view(len(residual), 6 * count, *J.shape[2:])).view(J.shape)
+    return _Linear(residual, squared, J, plain)
 
 
-def _after(motion: Tensor, step: Tensor) -> Tensor:
-    """Returns the motion followed by a small one, (rotation vector, translation) `[..., 6]`."""
-    turn, shift = step.unsqueeze(-1).split([3, 3], -2)
-    # Rodrigues' formula, as in `rotation_from_vector`. Building its matrix would take half of the
-    # time of a step for a single frame.
-    turns = turn.norm(dim=-2, keepdim=True) / math.pi
-    rows = motion[..., :3, :]
-    crossed = torch.linalg.cross(turn, rows, dim=-2)
-    twice = torch.linalg.cross(turn, crossed, dim=-2)
-    moved = rows + torch.sinc(turns) * crossed + 0.5 * torch.sinc(turns / 2).square() * twice
-    moved = moved + functional.pad(shift, (3, 0))
-    return torch.cat([moved, motion[..., 3:, :]], -2)
+def _weights(squared: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns the scale `[B, M, 1]`, px², and the roots of Geman-McClure's weights `[B, M, N]`."""
+    scale = _variance(squared, _SCALES).clamp(_LEAST_SCALE_PX**2, 1e8)
+    return scale, scale / (scale + squared)
 
 
-class _Weighted(NamedTuple):
-    """A motion's residuals, their Geman-McClure weights, and the directions that pixels determine.
+def _descended(
+    samples: _Samples, motion: Tensor, steps: int, fast_steps: int = 0, *, robust: bool = True
+) -> Tensor:
+    """Returns motions `[B, M, 4, 4]` after Gauss-Newton steps and fast ones.
 
-    To make radians and metres comparable, each parameter has a unit: a change by one unit moves all
-    pixels together by one pixel (root of the sum of squares). A parameter that moves no pixel has
-    the unit 0. Eigenvalues and eigenvectors are those of the normal matrix in these units. The
-    eigenvalue of a motion that the structure hides is near 0.
+    Among residuals of noise, the equations' slope is only half of the weights w, so that a step
+    leaves half of the way to go. Their squares are close to the slope, also without noise, where
+    both are 1. But far from the optimum such fast steps may go astray.
     """
-
-    at: _Linear
-    squared: Tensor  # [B, N], px²
-    scale: Tensor  # [B], px, `_SCALES` standard deviations
-    ratio: Tensor  # [B, N], squared / scale²
-    weight: Tensor  # [B, N]
-    right: Tensor  # [B, 6], J^T W r
-    unit: Tensor  # [B, 6]
-    values: Tensor  # [B, 6], ascending
-    vectors: Tensor  # [B, 6, 6], in columns
-    seen: Tensor  # [B, 6], bool: whether pixels determine the direction of an eigenvector
-
-
-def _weighted(samples: _Samples, motion: Tensor) -> _Weighted:
-    at = _linearised(samples, motion)
-    usable = samples.known & at.in_front
-    squared = torch.where(usable, _squared(samples, at.ru, at.rv), torch.inf)
-    scale = _SCALES * _scale(squared, samples.known.sum(-1))
-    scale = scale.clamp(min=_LEAST_SCALE_PX, max=1e4)
-    ratio = squared / scale.square().unsqueeze(-1)
-    weight = (1 + ratio).square().reciprocal()
-    normal, right = _normal_equations(samples, at, weight)
-    moves = (weight.unsqueeze(1) * (at.Ju.square() + at.Jv.square())).sum(-1).double()
-    unit = torch.where(moves > 1e-12, moves, torch.inf).rsqrt()
-    scaled = (unit.unsqueeze(-1) * normal * unit.unsqueeze(-2)).nan_to_num(0.0, 0.0, 0.0)
-    values, vectors = torch.linalg.eigh(scaled)  # raises for the whole batch if one holds nan
-    seen = values > _LEAST_EIGENVALUE
-    return _Weighted(at, squared, scale, ratio, weight, right, unit, values, vectors, seen)
+    batch, count = motion.shape[:2]
+    if count > 1:
+        samples = samples._replace(twists=samples.twists.repeat_interleave(count, 0))
+    turns, motion = samples.twists.flatten(2).mT, motion.flatten(0, 1)
+    factor, summand, still = _cached(_damping, motion.device, motion.dtype)
+    for step in range(steps + fast_steps):
+        residual, squared, J, _ = _linearised(samples, motion, count)
+        WJ = J
+        if robust:
+            _, kept = _weights(squared)
+            WJ = J * (kept * kept).view(len(J), 1, 1, J.shape[-1])
+        J, WJ = J.flatten(2), WJ.flatten(2)
+        normal = torch.bmm(WJ, (J if step < steps else WJ).mT)
+        right = torch.bmm(WJ, residual.reshape(len(J), J.shape[-1], 1))
+        normal = torch.addcmul(summand, normal, factor)
+        twist = torch.bmm(turns, torch.linalg.solve_ex(normal, right)[0]).view(-1, 4, 4)
+        # Cayley's (1 + X / 2)^-1 (1 - X / 2), which is rigid.
+        before = torch.bmm(torch.sub(still, twist, alpha=0.5), motion)
+        motion = torch.linalg.solve_ex(torch.add(still, twist, alpha=0.5), before)[0]
+    return motion.view(batch, count, 4, 4)
 
 
-def _descended(samples: _Samples, motion: Tensor, steps: int) -> Tensor:
-    """Returns the motion after Gauss-Newton steps, in the directions that pixels determine."""
-    for _ in range(steps):
-        now = _weighted(samples, motion)
-        # Take the step in the eigenbasis and only in the determined directions. In the others, a
-        # solver would divide by nearly 0.
-        along = (now.vectors.mT @ (now.unit * now.right).unsqueeze(-1)).squeeze(-1)
-        along = torch.where(now.seen, along / now.values, 0.0)
-        motion = _after(motion, -now.unit * (now.vectors @ along.unsqueeze(-1)).squeeze(-1))
-    return motion
-
-
-def _described(samples: _Samples, motion: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _described(samples: _Samples, motion: Tensor, number: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Returns a motion's inlier share `[B]`, covariance `[B, 6, 6]` and validity `[B]`."""
-    now = _weighted(samples, motion)
+    _, squared, each, plain = _linearised(samples, motion)
+    scale, kept = _weights(squared)
+    weight = kept.square()
+    total = weight.sum((1, 2)).clamp(min=1e-12)
+    J = each.flatten(2)
+    normal = torch.bmm((each * weight.unsqueeze(1)).flatten(2), J.mT).nan_to_num(0.0, 0.0, 0.0)
+    # To make radians and metres comparable, each parameter has a unit: a change by one unit moves
+    # all pixels together by one pixel (root of the sum of squares). A parameter that moves no pixel
+    # has the unit 0. The eigenvalue of a motion that the structure hides is near 0.
+    moves = normal.diagonal(dim1=-2, dim2=-1)
+    if samples.root is not None:
+        moves = (weight.unsqueeze(1) * plain.square()).sum((2, 3)).nan_to_num(0.0, 0.0, 0.0)
+    unit = torch.where(moves > 1e-12, moves, torch.inf).rsqrt()
+    # eigh raises for the whole batch if one matrix holds nan.
+    values, vectors = torch.linalg.eigh(unit.unsqueeze(-1) * normal * unit.unsqueeze(-2))
+    seen = values > _LEAST_EIGENVALUE
     # The covariance of an M-estimator is the sandwich A^-1 B A^-1. A is the derivative of its
     # equations: the normal matrix times the mean slope of w(r^2) r, which, averaged over the
-    # directions of r, is w (1 - 2 ratio / (1 + ratio)). B is the covariance of the noise in them.
-    weight, ratio, seen = now.weight, now.ratio, now.seen
-    slope = torch.where(weight > 0, weight * (1 - 2 * ratio / (1 + ratio)), 0.0).sum(-1)
-    slope = (slope / weight.sum(-1).clamp(min=1e-12)).clamp(min=0.1).double()
-    spread = torch.where(weight > 0, weight.square() * now.squared / 2, 0.0)
-    middle, _ = _normal_equations(samples, now.at, spread)
-    scaled = now.unit[..., None] * now.vectors * torch.where(seen, now.values.rsqrt(), 0.0)[:, None]
-    inverse = scaled @ scaled.mT
-    covariance = inverse @ middle @ inverse / slope.square()[:, None, None]
+    # directions of r, is w (2 sqrt(w) - 1). B is the covariance of the noise in them.
+    slope = (2 * (weight * kept).sum((1, 2)) / total - 1).clamp(min=0.1)
+    spread = weight.square() * squared / 2
+    middle = torch.bmm((each * spread.unsqueeze(1)).flatten(2), J.mT).nan_to_num(0.0, 0.0, 0.0)
+    scaled = unit[..., None] * vectors * torch.where(seen, values.rsqrt(), 0.0)[:, None]
+    inverse = torch.bmm(scaled, scaled.mT) / slope[:, None, None]
+    # Fewer known pixels than samples are repeated, but tell no more.
+    number = number.clamp(max=PIXELS)
+    repeats = PIXELS / number.clamp(min=1)
+    covariance = torch.bmm(torch.bmm(inverse, middle), inverse) * repeats[:, None, None]
     # A parameter with a component in an undetermined direction is not determined at all.
-    is_open = (now.vectors.square() * ~seen.unsqueeze(-2)).sum(-1) > 1e-6  # [B, 6]
-    covariance = torch.where(is_open.unsqueeze(-1) | is_open.unsqueeze(-2), 0.0, covariance)
-    variance = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0)  # rounding may make it negative
-    variance = torch.where(is_open, torch.inf, variance)
-    diagonal = torch.eye(6, dtype=torch.bool, device=motion.device)
-    covariance = torch.where(diagonal, variance.unsqueeze(-1), covariance)
-    is_motion = _is_motion(samples, now)
-    within = torch.where(is_motion, _INLIER_SCALES / _SCALES * now.scale, _STILL_PX)
-    share = (now.squared < within.square().unsqueeze(-1)).sum(-1) / samples.number.clamp(min=1)
-    enough = (samples.number >= MIN_PIXELS) & seen.all(-1) & motion.flatten(1).isfinite().all(-1)
-    return share, covariance, enough & is_motion
-
-
-def _is_motion(samples: _Samples, now: _Weighted) -> Tensor:
-    """Returns whether the flow isn't just noise `[B]`: the camera rests, or its motion is visible.
-
-    A motion can be fitted to noise, too. By chance, the mean square of its flow is 6 / 2N of that
-    of the noise, for six parameters and N pixels with two channels, and somewhat more because it is
-    the best of many hypotheses. Noise up to `_STILL_PX` can't be distinguished from a camera at
-    rest.
-    """
-    ego = _squared(samples, samples.values[:, 4] - now.at.ru, samples.values[:, 5] - now.at.rv)
-    ego = (now.weight * ego).sum(-1) / now.weight.sum(-1).clamp(min=1e-12)
-    deviation = now.scale / _SCALES
-    strength = ego / (2 * deviation.square())
-    by_chance = 3 / (samples.number - MIN_PIXELS).clamp(min=1)
-    is_shown = (strength > _LEAST_STRENGTH) & (strength > _LEAST_OVER_CHANCE * by_chance)
-    return (deviation <= _STILL_PX) | is_shown
+    is_open = (vectors.square() * ~seen.unsqueeze(-2)).sum(-1) > 1e-6  # [B, 6]
+    covariance = covariance.masked_fill(is_open.unsqueeze(-1) | is_open.unsqueeze(-2), 0.0)
+    variance = covariance.diagonal(dim1=-2, dim2=-1)
+    variance.clamp_(min=0.0).masked_fill_(is_open, torch.inf)  # rounding may make it negative
+    # A motion can be fitted to noise, too. By chance, the mean square of its flow is 6 / 2N of that
+    # of the noise, for six parameters and N pixels with two channels, and somewhat more because it
+    # is the best of many hypotheses. Noise up to `_STILL_PX` can't be distinguished from a camera
+    # at rest.
+    *_, ego = _residuals(samples._replace(target=samples.ray[:, None, :2]), motion, 1)
+    noise = scale[:, 0, 0] / _SCALES**2
+    strength = (weight * ego).sum((1, 2)) / total / (2 * noise)
+    by_chance = _LEAST_OVER_CHANCE * 3 / (number - MIN_PIXELS).clamp(min=1)
+    is_shown = strength > by_chance.clamp(min=_LEAST_STRENGTH)  # not where nan
+    is_motion = (noise <= _STILL_PX**2) | is_shown
+    within = torch.where(is_motion, _INLIER_SCALES**2 * noise, _STILL_PX**2)
+    share = (squared[:, 0] < within.unsqueeze(-1)).sum(-1) / PIXELS
+    is_known = (number >= MIN_PIXELS) & seen.all(-1)
+    return share, covariance, is_known & is_motion
