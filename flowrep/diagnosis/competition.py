@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from flowrep.diagnosis import explanation, fit, pictures
+from flowrep.diagnosis.candidates import Candidate, candidate
 from flowrep.diagnosis.explanation import Explanation
 from flowrep.diagnosis.fit import EYE, Pairs, flow_of, length, median, residuals
-from flowrep.diagnosis.pictures import Mixture, Noise
-from flowrep.diagnosis.rivals import Rival, fitted_numbers
+from flowrep.diagnosis.pictures import Metric, Mixture, Noise
+from flowrep.diagnosis.rivals import Rival
 from flowrep.geometry.egomotion import motion_of_points
 
 _SCORED = 9  # corrections of the data that compete in full, those that fit best with exact poses
@@ -40,103 +40,112 @@ class Competition:
 
     def __init__(self, pairs: Pairs, rivals: Sequence[Rival]) -> None:
         if not pairs.by_flow and pairs.has_poses:
-            # What the recorded motion takes out of the picture is no evidence against it.
-            known = ~pairs.depth.isnan()
-            seen = residuals(pairs, pairs.motion)[:, 0].isfinite()
-            is_most = seen.sum(-1, keepdim=True) > 0.5 * known.sum(-1, keepdim=True)
-            pairs = pairs._replace(depth=pairs.depth.masked_fill(~seen & is_most, math.nan))
-        none, self._has_poses = pairs.depth[:, :0], pairs.has_poses
-        rivals = [r for r in rivals if pairs.has_poses or r.subject != "poses"]
-        self.rivals = rivals
-        without = [r for r in rivals if r.subject == "poses" and not r.start[0]]
-        starts = _starts(pairs, [rival.change(pairs, none).motion for rival in without])
-        noise = _noise(pairs, starts)
-        starts = fit.refined(pairs, starts, noise.px)
-        noise = _noise(pairs, starts)
-        shown = pictures.mixture(pairs, starts, noise)
-        noise = pictures.learnt_noise(pairs, _left(pairs, starts, shown))
-        best = flow_of(pairs, pictures.best_of(shown))
-        self.flow_px = median(fit.middle(pairs.raw if pairs.by_flow else best))
+            pairs = _in_both_pictures(pairs)
+        self._has_poses = pairs.has_poses  # at the ends of a recording, candidates may have none
+        self.rivals = [r for r in rivals if pairs.has_poses or r.subject != "poses"]
+        starts, shown, noise = _first_look(pairs, self.rivals)
+        likely = pictures.best_of(shown)
+        self.flow_px = median(fit.middle(pairs.raw if pairs.by_flow else flow_of(pairs, likely)))
         pairs = pairs._replace(smooth=_smooth(pairs, shown))
-        own = pairs.motion if pairs.has_poses else pictures.best_of(shown)
-        tried = []
-        for rival in rivals:
-            fitted = fitted_numbers(pairs, rival, torch.where(own.isfinite(), own, EYE), noise.px)
-            if fitted is not None:
-                tried.append((rival, *fitted))
-        data = sorted((t for t in tried if t[0].subject != "poses"), key=lambda t: t[2])
+        own = torch.where(pairs.motion.isfinite(), pairs.motion, EYE) if pairs.has_poses else likely
+        found = (candidate(pairs, rival, own, noise.px) for rival in self.rivals)
+        of_poses: list[Candidate] = []
+        of_data: list[Candidate] = []
+        for each in (x for x in found if x is not None):
+            (of_poses if each.rival.subject == "poses" else of_data).append(each)
         # Without poses, the motion that a correction makes fit isn't known yet: all compete.
-        data = data[:_SCORED] if pairs.has_poses else data
-        changes: list[tuple[Any, ...]] = [(NO_RIVAL, none, pairs)]
-        if any(rival.subject == "flow" for rival, *_ in data):
-            changes.append((OF_NOISE, none, OF_NOISE.change(pairs, none)))
-        changes += [(rival, n, rival.change(pairs, n)) for rival, n, _ in data]
-        begun = [_motions(changed, shown, noise) for *_, changed in changes]
-        # Motions that any of them finds are tried on the data of all, also on those as recorded.
-        pool = torch.cat([starts, *begun])
-        motions = [
-            torch.cat([own, fit.refined(changed, _nearest(changed, pool), noise.px, 4)])
-            for own, (*_, changed) in zip(begun, changes)
-        ]
-        noises = [_noise(changed, each) for each, (*_, changed) in zip(motions, changes)]
-        self.noise = noise = min(noises, key=lambda each: float(each.px.log().mean()))
+        scored = _SCORED if pairs.has_poses else len(of_data)
+        of_data = sorted(of_data, key=lambda each: each.misfit)[:scored]
+        recorded, still, of_noise = (
+            Candidate(rival, pairs.depth[:, :0], rival.change(pairs, pairs.depth[:, :0]))
+            for rival in (NO_RIVAL, STILL, OF_NOISE)
+        )
+        nulls = [recorded] + [of_noise] * any(each.rival.subject == "flow" for each in of_data)
+        motions = _motions([*nulls, *of_data], starts, shown, noise)
+        noises = (_noise(each.pairs, own) for each, own in zip([*nulls, *of_data], motions))
+        self.noise = min(noises, key=lambda each: float(each.px.log().mean()))
         least_px = 1e-3 if pairs.by_flow else 1e-2
-        self._limits = (
-            self.flow_px,
-            least_px,
-            max(explanation.most_noise_px(pairs, self.flow_px), 2 * least_px),
-        )
-        found = []
-        for (rival, n, changed), each in zip(changes, motions):
-            shown = pictures.mixture(changed, each, noise)
-            if rival is NO_RIVAL and pairs.by_flow and pairs.has_poses:
-                shown = pictures.either(shown, _beside_bodies(pairs, noise))
-            found.append(
-                self._explained(rival, n, changed, shown, pictures.metric(changed, shown, noise))
-            )
-        self.recorded, *self.others = found
-        self.of_noise = (
-            self.others.pop(0) if len(changes) > 1 and changes[1][0] is OF_NOISE else None
-        )
-        self.others += [
-            self._of_poses(rival, n) for rival, n, _ in tried if rival.subject == "poses"
-        ]
-        self.still = self._of_poses(STILL, none) if self._has_poses else None
+        most_px = max(explanation.most_noise_px(pairs, self.flow_px), 2 * least_px)
+        self._limits = self.flow_px, least_px, most_px
+        explained = [self._explained(*both) for both in zip([*nulls, *of_data], motions)]
+        self.recorded, *self.others = explained
+        self.of_noise = self.others.pop(0) if len(nulls) > 1 else None
+        self.others += [self._of_poses(each) for each in of_poses]
+        self.still = self._of_poses(still) if pairs.has_poses else None
         self.rule_px = self.rule_nats = 0.0
         if self.recorded.poses is not None and len(pairs.K) >= 8:
             rule = explanation.by_a_rule(self.recorded)
-            after = explanation.poses(
-                pairs.motion, self.recorded.shown, self.recorded.metric, *self._limits, rule
-            )
+            shown, metric = self.recorded.shown, self.recorded.metric
+            after = explanation.poses(pairs.motion, shown, metric, *self._limits, rule)
             self.rule_px = median(rule.norm(dim=-1))
-            self.rule_nats = explanation.clipped_sum(after.nats - self.recorded.poses.nats)
+            self.rule_nats = explanation.agreed(after.nats - self.recorded.poses.nats)
 
     def is_seen(self, other: Explanation) -> bool:
         """Whether data show what it needs: raw flow beyond noise, or else a camera that moves."""
         null = self.of_noise if other.rival.subject == "flow" else self.still
         return null is None or other.nats - null.nats > explanation.SURE
 
-    def _of_poses(self, rival: Rival, n: Tensor) -> Explanation:
-        """Returns a rival that changes poses alone: pictures show what they do as recorded."""
-        pairs, shown, metric = self.recorded.pairs, self.recorded.shown, self.recorded.metric
-        found = self._explained(rival, n, rival.change(pairs, n), shown, metric)
-        if rival.is_of_time:
+    def _explained(self, by: Candidate, motions: Tensor) -> Explanation:
+        """Returns a candidate that changes what pictures show, given motions `[M, P, 4, 4]`."""
+        shown = pictures.mixture(by.pairs, motions, self.noise)
+        if by.rival is NO_RIVAL and by.pairs.by_flow and by.pairs.has_poses:
+            shown = pictures.either(shown, _beside_bodies(by.pairs, self.noise))
+        return self._scored(by, shown, pictures.metric(by.pairs, shown, self.noise))
+
+    def _of_poses(self, by: Candidate) -> Explanation:
+        """Returns a candidate that changes poses alone: pictures show what they do as recorded."""
+        found = self._scored(by, self.recorded.shown, self.recorded.metric)
+        if by.rival.of_time:
             # Poses between two recorded ones have less noise: only what the opposite time doesn't
             # gain speaks for a delay.
-            n = -found.n.expand(len(pairs.K), -1)
-            back = self._explained(rival, n, rival.change(pairs, n), shown, metric)
-            found = replace(found, handicap=max(back.nats - self.recorded.nats, 0.0))
+            pairs = by.rival.change(self.recorded.pairs, -found.n.expand(len(by.n), -1))
+            back = self._scored(by._replace(pairs=pairs, surprise=0.0), found.shown, found.metric)
+            gain = max(back.nats - self.recorded.nats, 0.0)
+            found = replace(found, handicap=found.handicap + gain)
         return found
 
-    def _explained(
-        self, rival: Rival, n: Tensor, pairs: Pairs, shown: Mixture, metric: Any
-    ) -> Explanation:
-        of = (
-            explanation.poses(pairs.motion, shown, metric, *self._limits)
-            if self._has_poses
-            else None
-        )
-        return Explanation(rival, n.nanmedian(0).values, pairs, shown, metric, of)
+    def _scored(self, by: Candidate, shown: Mixture, metric: Metric) -> Explanation:
+        poses, n = None, by.n.nanmedian(0).values
+        if self._has_poses:
+            poses = explanation.poses(by.pairs.motion, shown, metric, *self._limits)
+        return Explanation(by.rival, n, by.pairs, shown, metric, poses, by.surprise)
+
+
+def _in_both_pictures(pairs: Pairs) -> Pairs:
+    """Returns pairs without pixels that the recorded motion takes out of the picture.
+
+    They are no evidence against it, unless they are most.
+    """
+    seen, known = residuals(pairs, pairs.motion)[:, 0].isfinite(), ~pairs.depth.isnan()
+    is_most = seen.sum(-1, keepdim=True) > 0.5 * known.sum(-1, keepdim=True)
+    return pairs._replace(depth=pairs.depth.masked_fill(~seen & is_most, math.nan))
+
+
+def _first_look(pairs: Pairs, rivals: Sequence[Rival]) -> tuple[Tensor, Mixture, Noise]:
+    """Returns motions `[M, P, 4, 4]` as a start for fits, which the pictures show, and noise."""
+    none = pairs.depth[:, :0]
+    closed = [
+        r.change(pairs, none).motion for r in rivals if r.subject == "poses" and not r.start[0]
+    ]
+    starts = _starts(pairs, closed)
+    starts = fit.refined(pairs, starts, _noise(pairs, starts).px)
+    shown = pictures.mixture(pairs, starts, _noise(pairs, starts))
+    return starts, shown, pictures.learnt_noise(pairs, _left(pairs, starts, shown))
+
+
+def _motions(
+    candidates: Sequence[Candidate], starts: Tensor, shown: Mixture, noise: Noise
+) -> list[Tensor]:
+    """Returns the motions `[M, P, 4, 4]` that pictures show by each candidate.
+
+    Motions that any of them finds are tried on the data of all, also on those as recorded.
+    """
+    own = [_shown_by(each.pairs, shown, noise) for each in candidates]
+    pool = torch.cat([starts, *own])
+    return [
+        torch.cat([of, fit.refined(by.pairs, _nearest(by.pairs, pool), noise.px, 4)])
+        for by, of in zip(candidates, own)
+    ]
 
 
 def _starts(pairs: Pairs, closed: Sequence[Tensor]) -> Tensor:
@@ -155,7 +164,7 @@ def _starts(pairs: Pairs, closed: Sequence[Tensor]) -> Tensor:
     return torch.stack(starts)
 
 
-def _motions(pairs: Pairs, shown: Mixture, noise: Noise) -> Tensor:
+def _shown_by(pairs: Pairs, shown: Mixture, noise: Noise) -> Tensor:
     """Returns motions that changed pictures show: those next to known ones, and a body's."""
     motion = pairs.motion
     if not pairs.has_poses:

@@ -304,7 +304,7 @@ def _bodies(seen: _Seen) -> tuple[str, str]:
     best = flow_of(pairs, pictures.best_of(shown))
     off_px = median(middle(best - flow_of(pairs, pairs.motion)))
     most_px = explanation.most_noise_px(pairs, competition.flow_px)
-    gain = explanation.clipped_sum(shown.nats - exact.nats)
+    gain = explanation.agreed(shown.nats - exact.nats)
     if gain > max(explanation.SURE, 5 * len(bodies)) and off_px > most_px:  # 5 nats for each
         why = f"another motion, {off_px:.2g} px from theirs, fits their pixels better"
         return "fault", f"instance_motion or ids don't fit the bodies: {why}"

@@ -24,6 +24,9 @@ from flowrep.diagnosis.rivals import Rival
 # of fifty rivals; noise that pixels share doubles what chance gives.
 SURE = 25.0
 _MOST_NATS = 10.0  # that a pair counts for or against an explanation, of few pairs more
+_BODY = 0.03  # of the pixels: a motion of fewer may be chance
+_FEW_PAIRS = 3  # that show a body
+_DECIDES = 3.0  # nats, between two models of noise: twenty to one
 _RATES = (0.02, 0.3)  # shares of pairs whose poses are bad
 
 
@@ -33,7 +36,8 @@ class Poses(NamedTuple):
     Its length is the root mean square of the flow that it causes over the motion's pixels. `cov`
     `[P, 6, 6]` is that of the picture's motion, `noise_px` the learnt noise of rotation and of
     translation, `noise` `[P, 6, 6]` both, `nats` `[P]` the log-likelihood, nan where a motion is
-    unknown, `is_bad` whether a pair's pose is off by more than noise, `mode` the motion of the
+    unknown, `deviations` `[6]` the noise as rotation and
+    translation, `is_bad` whether a pair's pose is off by more than noise, `mode` the motion of the
     picture that it is compared with, and `root` that motion's, see `Metric`.
     """
 
@@ -45,6 +49,7 @@ class Poses(NamedTuple):
     noise: Tensor
     is_bad: Tensor
     mode: Tensor
+    deviations: Tensor
 
     @property
     def sigma_px(self) -> Tensor:
@@ -71,10 +76,8 @@ def poses(
     is_shown, is_known = shown.motions[..., 0, 0].isfinite(), motion.isfinite().flatten(1).all(-1)
     of_turn, of_shift = (half @ half.mT for half in root.split(3, -1))
     likely = shown.log_odds.argmax(0), torch.arange(len(motion))
-    of_turn, of_shift = (
-        each / median(each[likely].diagonal(dim1=-2, dim2=-1).sum(-1))
-        for each in (of_turn, of_shift)
-    )
+    units = [median(x[likely].diagonal(dim1=-2, dim2=-1).sum(-1)) for x in (of_turn, of_shift)]
+    of_turn, of_shift = of_turn / units[0], of_shift / units[1]
     sizes = torch.logspace(math.log10(least_px), math.log10(most_px), 6).double()
     turn, shift = (x.flatten() for x in torch.meshgrid(sizes, sizes, indexing="ij"))
     turn, shift = (x[:, None, None, None, None] for x in (turn, shift))
@@ -99,8 +102,11 @@ def poses(
     _, nats, i, is_bad = best
     pair, at = torch.arange(len(motion)), mode[i]
     noise = (turn[i].square() * of_turn + shift[i].square() * of_shift)[at, pair]
-    return Poses(y[at, pair], cov[at, pair], root[at, pair], torch.where(is_known, nats, math.nan),
-                 (float(turn[i]), float(shift[i])), noise, is_bad & is_known, at)  # fmt: skip
+    noise_px = float(turn[i]), float(shift[i])
+    deviations = torch.tensor([px / math.sqrt(unit) for px, unit in zip(noise_px, units)]).double()
+    nats = torch.where(is_known, nats, math.nan)
+    return Poses(y[at, pair], cov[at, pair], root[at, pair], nats, noise_px, noise,
+                 is_bad & is_known, at, deviations.repeat_interleave(3))  # fmt: skip
 
 
 def _deviation(motion: Tensor, shown: Mixture, by: Metric) -> Tensor:
@@ -145,28 +151,50 @@ class Explanation:
         return float(self.of_pairs.sum()) - self.handicap
 
     def sure_nats(self, recorded: Explanation) -> float:
-        """Returns by how much it is better than the data as recorded; no pair decides alone."""
-        return clipped_sum(self.of_pairs - recorded.of_pairs) - self.handicap
+        """Returns by how much pairs agree that it is better than the data as recorded."""
+        return agreed(self.of_pairs - recorded.of_pairs) - self.handicap
 
     @property
     def deviation_px(self) -> float:
         """How far recorded motions are from those of the pictures, without the latter's noise."""
         assert self.poses is not None
-        square = median(self.poses.y.norm(dim=-1)) ** 2 - median(self.poses.sigma_px) ** 2
+        used = ~self.poses.is_bad if self.is_beside_bodies else slice(None)
+        square = (
+            median(self.poses.y.norm(dim=-1)[used]) ** 2 - median(self.poses.sigma_px[used]) ** 2
+        )
         return math.sqrt(max(square, 0.0))
 
+    @cached_property
+    def is_beside_bodies(self) -> bool:
+        """Whether some pairs show the recorded motion beside another: that of a body.
+
+        Where pairs show another motion alone, the body may fill the picture.
+        """
+        assert self.poses is not None
+        pair, known = torch.arange(len(self.poses.y)), ~self.pairs.depth.isnan()
+        others = self.shown.odds.amax(0) - self.shown.odds[self.poses.mode, pair]
+        share = torch.where(known, others, math.nan).nanmean(-1)
+        is_beside = (share > _BODY) & ~self.poses.is_bad
+        return self.pairs.by_flow and int(is_beside.sum()) >= _FEW_PAIRS
+
+    @cached_property
     def systematic_px(self) -> tuple[float, float]:
         """Returns the error that all recorded motions share, and twice its standard deviation."""
         found, pair = self.poses, torch.arange(len(self.shown.nats))
         assert found is not None
-        information = self.metric.information[found.mode, pair]
-        W = information @ torch.linalg.inv_ex(torch.eye(6) + found.noise @ information)[0]
         used = found.nats.isfinite()
         used = used & ~found.is_bad if (used & ~found.is_bad).any() else used
+        information = self.metric.information[found.mode, pair] * used[:, None, None]
         most_px = self.metric.most_px[found.mode, pair][used].median()
-        cov = torch.linalg.inv_ex(W[used].sum(0) + torch.eye(6) / most_px.square())[0]
-        y = cov @ (W @ found.y.unsqueeze(-1))[used].sum(0)
-        return float(y.norm()), 2 * float(cov.trace().clamp(min=0).sqrt())
+        # Noise is that of motions, or else that of poses, which the two pairs of a frame share.
+        follows = self.pairs.follows
+        of_motions, of_poses = (
+            _common(found, information, most_px, joint) for joint in (0 * follows, follows)
+        )
+        c, cov, _ = of_poses if of_poses[2] > of_motions[2] + _DECIDES else of_motions
+        root = found.root[used]
+        square = (root @ cov @ root.mT).diagonal(dim1=-2, dim2=-1).sum(-1)
+        return median((root @ c).norm(dim=-1)), 2 * median(square.clamp(min=0).sqrt())
 
     @property
     def motion(self) -> Tensor:
@@ -188,10 +216,42 @@ class Explanation:
         return max(float(x.median()) if len(x) else 0.0 for x in sizes)
 
 
-def clipped_sum(nats: Tensor) -> float:
-    """Returns the sum over pairs `[P]`, of which none decides alone."""
+def _common(
+    found: Poses, information: Tensor, most_px: Tensor, follows: Tensor
+) -> tuple[Tensor, Tensor, float]:
+    """Returns the motion `[6]` that deviations have in common, its covariance, and the evidence.
+
+    Args:
+        information: `[P, 6, 6]`, that of pictures of the deviations.
+        follows: `[P - 1]`, whether pairs share the noise of the pose between them.
+    """
+    count = len(found.y)
+    # The noise of each pose is a latent motion, as is the common one, which comes last.
+    last = torch.arange(count) + torch.cat([torch.zeros(1), (~follows.bool()).cumsum(0)]).long()
+    at = torch.zeros(count, int(last[-1]) + 3).double()
+    each = torch.arange(count)
+    at[each, last], at[each, last + 1], at[:, -1] = -1.0, 1.0, 1.0
+    H = torch.einsum("pl,pij->pilj", at, found.root).flatten(2)
+    of_noise = found.deviations.square() / 2
+    common = (found.root.mT @ found.root).mean(0) / most_px.square()
+    prior = torch.block_diag(*[of_noise.reciprocal().diag()] * (at.shape[1] - 1), common)
+    A = prior + (H.mT @ information @ H).sum(0)
+    b = (H.mT @ information @ found.y.unsqueeze(-1)).sum(0).squeeze(-1)
+    cov = torch.linalg.inv(A)
+    n = cov @ b
+    evidence = b @ n + prior.logdet() - A.logdet()
+    return n[-6:], cov[-6:, -6:], float(evidence / 2)
+
+
+def agreed(nats: Tensor) -> float:
+    """Returns the nats by which pairs `[P]` agree on an explanation; none decides alone.
+
+    It is the sum less twice its standard deviation: errors that pixels share make the nats of a
+    pair too large, but not those of all pairs alike.
+    """
     most = max(_MOST_NATS, 2 * SURE / len(nats))
-    return float(nats.clamp(-most, most).nansum())
+    nats = nats[~nats.isnan()].clamp(-most, most)
+    return float(nats.sum() - 2 * math.sqrt(len(nats)) * nats.std(correction=0))
 
 
 def by_a_rule(recorded: Explanation) -> Tensor:

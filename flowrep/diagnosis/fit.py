@@ -83,6 +83,11 @@ class Pairs(NamedTuple):
         return relative_motion(self.path[:, 1], self.path[:, 2], dtype=torch.float64)
 
     @property
+    def follows(self) -> Tensor:
+        """Whether each pair but the last ends where the next one begins, [P - 1]."""
+        return (self.path[1:, 1] == self.path[:-1, 2]).flatten(1).all(1)
+
+    @property
     def has_poses(self) -> bool:
         """Whether the recorded motions are known."""
         return bool(self.path[:, 1:3].isfinite().all())

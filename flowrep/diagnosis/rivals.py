@@ -15,11 +15,9 @@ from flowrep import geometry
 from flowrep.diagnosis.fit import (
     EYE,
     Pairs,
-    gauss_newton,
     homogeneous,
     looked_up,
     motion_vector,
-    residuals,
     skew_part,
     small_motion,
 )  # fmt: skip
@@ -27,8 +25,6 @@ from flowrep.diagnosis.fit import (
 Change = Callable[[Pairs, Tensor], Pairs]  # of pairs, with numbers [P, k]
 # Half turns, near which no fit that starts at none gets.
 _TURNS = tuple(tuple(3.0 * (i == j) for j in range(6)) for i in range(-1, 3))
-# A fitted factor beyond these, or below their inverse, is no camera's and no unit's.
-_LARGEST_FACTORS = {"camera": 30.0, "depth": 1e5}
 
 
 class Rival(NamedTuple):
@@ -42,9 +38,15 @@ class Rival(NamedTuple):
         start: where the fit of the numbers starts; of several, the one that leads to the smallest
             residuals counts.
         usual: numbers of a typical mistake, to see whether it would show.
+        spread: standard deviations of the numbers around where they start, of factors those of
+            their logarithms.
         per_pair: whether the numbers differ from pair to pair.
         in_pixels: whether the numbers, shares of the width, are rounded to whole pixels after the
             fit. Interpolated depth has less noise, for which alone the rival would win.
+        is_vague: whether it stands for many mistakes, and names none.
+        of_time: whether it interpolates between poses.
+        reverses: whether it looks at pairs of frames from the earlier one.
+        changes_poses: whether it changes poses beside its subject.
     """
 
     subject: Literal["poses", "flow", "camera", "depth"]
@@ -53,29 +55,25 @@ class Rival(NamedTuple):
     change: Change
     start: tuple[tuple[float, ...], ...] = ((),)
     usual: tuple[float, ...] = ()
+    spread: tuple[float, ...] = (1.0,)
     per_pair: bool = False
     in_pixels: bool = False
+    is_vague: bool = False
+    of_time: bool = False
+    reverses: bool = False
+    changes_poses: bool = False
 
     @property
-    def is_vague(self) -> bool:
-        """Whether it stands for many mistakes, and names none."""
-        return self.subject == "depth" and self.remedy.startswith(("depth isn't", "depth plus"))
-
-    @property
-    def is_of_time(self) -> bool:
-        """Whether it interpolates poses, which makes their noise smaller."""
-        return self.change is _later
-
-    @property
-    def reverses(self) -> bool:
-        """Whether it looks at pairs of frames from the earlier one."""
-        return self.change in (_late_depth, _of_previous)
+    def name(self) -> str:
+        """The remedy without numbers."""
+        return self.remedy.partition("={")[0].partition("=[")[0].partition(" {")[0]
 
     def texts(self, numbers: Tensor, width: int) -> tuple[str, str]:
         """Returns the remedy and the description, with the numbers that were fitted."""
         n, values = [*numbers.tolist(), 0.0, 0.0], {}
         values["inverse"] = f"{1 / n[0] if n[0] else math.inf:.3g}"
         values["far"] = f"{1 / max(n[0] + n[1], 1e-6):.3g}"
+        values["fy"] = f"{n[0] * n[1]:.3g}"
         if len(numbers) >= 2:  # the last two of some are shares of the width
             values["px"] = f"({width * n[-4]:+.1f}, {width * n[-3]:+.1f}) px"
         if len(numbers) in (3, 6):
@@ -120,7 +118,7 @@ def rivals_of(
         Rival("poses", "pose_lag_frames=-1", "poses are a frame early",
               _path(lambda path: path[:, [0, 0, 1, 2]])),
         Rival("poses", "poses {0:.2f} frames later", "the times of poses are {0:.2f} frames late",
-              _later, ((0.0,),), (0.5,)),
+              _later, ((0.0,),), (0.5,), of_time=True),
         Rival("poses", "marker_from_cam={matrix}",
               "the camera is turned on its mount, {degrees} degrees", _on_a_mount,
               tuple(turn[:3] for turn in _TURNS), (0.1,) * 3),
@@ -135,11 +133,11 @@ def rivals_of(
               _camera(lambda *k: [k[-1][0] * x for x in k[:4]]), ((1.0,), (0.4,), (2.5,)), (1.25,)),
         Rival("camera", "cx and cy moved by {px}", "the pictures were cropped, K was not",
               _camera(lambda fx, cx, fy, cy, w, h, n: (fx, cx + w * n[0], fy, cy + w * n[1])),
-              ((0.0, 0.0), (0.5, 0.5)), (0.1, 0.1)),
-        Rival("camera", "fx times {0:.3g}, fy times {1:.3g}, cx and cy moved by {px}",
+              ((0.0, 0.0), (0.5, 0.5)), (0.1, 0.1), (0.2, 0.2)),
+        Rival("camera", "fx times {0:.3g}, fy times {fy}, cx and cy moved by {px}",
               "K is another camera's", _camera(lambda fx, cx, fy, cy, w, h, n: (
-                  fx * n[0].clamp(0.01), cx + w * n[2], fy * n[1].clamp(0.01), cy + w * n[3])),
-              ((1.0, 1.0, 0.0, 0.0),)),
+                  fx * n[0], cx + w * n[2], fy * n[0] * n[1], cy + w * n[3])),
+              ((1.0, 1.0, 0.0, 0.0),), spread=(0.7, 0.2, 0.2, 0.2)),
         Rival("camera", "a K for each frame", "K changes from frame to frame",
               _zoomed, ((1.0, 1.0),), (1.01, 1.0), per_pair=True),
         Rival("camera", "distortion=[{0:.2g},0,0,0]", "the lens bends the picture (calibrate it)",
@@ -150,14 +148,15 @@ def rivals_of(
               (2.0,)),
         Rival("depth", "depth_kind=disparity baseline_m={0:.3g}", "depth is a disparity",
               lambda p, n: _depth(lambda d, by: by.clamp(1e-6) / d)(p, n * p.K[:, :1, 0]),
-              ((0.01,), (0.05,), (0.2,), (1.0,), (5.0,), (100.0,))),
+              ((0.01,), (0.05,), (0.2,), (1.0,))),
         Rival("depth", "depth_kind=z_buffer near_m={inverse} far_m={far}",
               "depth is a buffer's", _depth(_from_buffer), ((5.0, -5.0),)),
         Rival("depth", "depth isn't linear", "depth isn't metres times a unit",
               _depth(lambda z, n: n[:, :1].clamp(1e-3) * z.clamp(1e-6) ** n[:, 1:].clamp(-3.0)),
-              ((1.0, 1.0), (1.0, 2.0))),
+              ((1.0, 1.0), (1.0, 2.0)), is_vague=True),
         Rival("depth", "depth plus {0:.3g} m", "depth has an offset",
-              _depth(lambda z, n: (n[:, 1:] * z + n[:, :1]).clamp(min=1e-6)), ((0.0, 1.0),)),
+              _depth(lambda z, n: (n[:, 1:] * z + n[:, :1]).clamp(min=1e-6)), ((0.0, 1.0),),
+              is_vague=True),
     ]  # fmt: skip
     is_z = given["depth_kind"] != "ray_length"
     kind, what = ("ray_length", "the ray's length") if is_z else ("z", "z, not the ray's length")
@@ -179,7 +178,8 @@ def rivals_of(
             Rival("depth", "depth moved by {px}", "depth isn't registered to the pictures",
                   _moved_depth, ((0.0, 0.0), (0.06, 0.0), (-0.06, 0.0)), (0.05, 0.0),
                   in_pixels=True),
-            Rival("depth", "depth of the next frame", "depth is a frame late", _late_depth),
+            Rival("depth", "depth of the next frame", "depth is a frame late", _late_depth,
+                  reverses=True, changes_poses=True),
         ]  # fmt: skip
     if of_flow:
         other = {"backward": "forward", "forward": "backward"}[given["flow_direction"]]
@@ -199,9 +199,10 @@ def rivals_of(
             Rival("flow", "flow divided by {0:.3g}", "flow is of pictures {0:.3g} times as large",
                   lambda p, n: p._replace(gain=p.gain * n.unsqueeze(-1)),
                   ((1.0,), (0.4,), (2.5,)), (1.5,)),
-            Rival("flow", "flow_to=next backwards=true", "flow leads to the next frame", _to_next),
+            Rival("flow", "flow_to=next backwards=true", "flow leads to the next frame", _to_next,
+                  changes_poses=True),
             Rival("flow", "flow on this frame's grid", "flow is on the previous one's",
-                  _of_previous),
+                  _of_previous, reverses=True, changes_poses=True),
         ]  # fmt: skip
     return table
 
@@ -364,63 +365,3 @@ def _of_previous(pairs: Pairs, n: Tensor) -> Pairs:
 
 def _late_depth(pairs: Pairs, n: Tensor) -> Pairs:
     return _reversed(pairs, pairs.pixel - pairs.shift, pairs.now)
-
-
-def fitted_numbers(
-    pairs: Pairs, rival: Rival, motion: Tensor, noise: Tensor
-) -> tuple[Tensor, float] | None:
-    """Returns a rival's numbers `[P, k]`, fitted to the other half of the pairs, and their cost.
-
-    Of fewer than four pairs, all share a number.
-
-    None if there are too few pairs, or if a factor is too large or too small.
-
-    Args:
-        motion: the recorded motions `[P, 4, 4]`, or those of the pictures in their place.
-        noise: standard deviations of residuals `[P, N]`, px.
-    """
-    count, k, few = len(noise), len(rival.start[0]), pairs.few
-    noise = noise[:, : few.depth.shape[1]]
-    if count < 4 and k > 1:
-        return None
-    is_of_poses = rival.subject == "poses" or "=next" in rival.remedy or "grid" in rival.remedy
-    is_of_poses |= rival.change is _late_depth
-
-    def residuals_of(n: Tensor) -> Tensor:
-        changed = [rival.change(few, each) for each in n]
-        moved = [each.motion if is_of_poses and few.has_poses else motion for each in changed]
-        return torch.stack([residuals(each, m) for each, m in zip(changed, moved)])
-
-    def cost(n: Tensor) -> float:
-        squared = (residuals_of(n.unsqueeze(0)) / noise.unsqueeze(1)).square().sum(2)
-        return float(squared.nan_to_num(1e6).log1p().mean())
-
-    starts = [noise.new_tensor(start).expand(count, k) for start in rival.start]
-    if not k:
-        return starts[0], cost(starts[0])
-    every = torch.arange(count)
-    half = every % 2 if count >= 4 else 0 * every
-    group = every if rival.per_pair else half
-    start = min(starts, key=cost)[0]
-
-    def numbers(m: Tensor) -> Tensor:
-        """Factors are fitted as their logarithms."""
-        return torch.where(start != 0, start * m.exp(), m)
-
-    m = noise.new_zeros(int(group.max()) + 1, k)
-    n = numbers(gauss_newton(lambda m: residuals_of(numbers(m)), m, group, noise, steps=5)[0])
-    if rival.per_pair:
-        # A frame's number is taken from the fit to the other pair that has this frame.
-        follows, own = (pairs.path[1:, 1] == pairs.path[:-1, 2]).flatten(1).all(1), n
-        if not follows.any():
-            return None
-        n = n.clone()
-        n[:-1, 0] = torch.where(follows, own[1:, 1], own[:-1, 0])
-        n[1:, 1] = torch.where(follows, own[:-1, 0], own[1:, 1])
-    else:
-        n = n[half.max() - half]
-    if rival.in_pixels:
-        n = (n * pairs.now.shape[-1]).round() / pairs.now.shape[-1]
-    first, most = n.new_tensor(rival.start[0]), _LARGEST_FACTORS.get(rival.subject, math.inf)
-    factors = n[:, first != 0] / first[first != 0]
-    return (n, cost(n)) if bool(((factors > 1 / most) & (factors < most)).all()) else None

@@ -17,7 +17,7 @@ from flowrep.diagnosis.rivals import Rival
 # "right".
 _HARMLESS_PX = 0.05
 _HARMLESS = 0.05  # of the flow's length
-_REST_PX = 0.25  # flow of a camera at rest: poses' noise is all that a correction may change
+_REST_PX = 0.25  # flow of a camera at rest: there is none but poses' noise to be wrong
 _ALIKE = 3.0  # nats: explanations that are as near to the likeliest are told beside it
 _ALIKE_SHARE = 0.7  # of a vague one's nats: a mistake with a name explains as much
 _NOISE = 3.0  # times the noise: differences below it may be noise
@@ -89,107 +89,144 @@ def judged(
         names: the names of the frames.
         instruction: tells the user what to do, given `Rival.remedy` and the corrected pairs.
     """
-    recorded, rivals, flow_px = found.recorded, found.rivals, found.flow_px
-    pairs, width = recorded.pairs, recorded.pairs.now.shape[-1]
-    harmless_px = max(_HARMLESS_PX, _HARMLESS * flow_px)
-    unsure_px = 3 * harmless_px
-    # Flow's errors that are alike in all pictures, so that more pictures don't show them.
-    bias_px = _HARMLESS_PX + _HARMLESS * flow_px if pairs.is_estimated else 0.0
-    effects = {each: each.effect_px(recorded) for each in found.others}
-    numbers: dict[str, Any] = {
-        "pairs": len(pairs.K), "raw_px": flow_px,
-        "best_px": median(middle(residuals(pairs, best_of(recorded.shown)))),
-        **_errors_px(found, effects, bias_px), "left_px": _left_px(recorded),
-        "rivals_px": {e.rival.texts(e.n, width)[0]: _left_px(e) for e in found.others},
-    }  # fmt: skip
-    size, unknown = f"flow: {flow_px:.2g} px", f"and none of {len(rivals)} known mistakes explains"
+    case = _Case(found)
+    return (
+        case.of_a_likelier_explanation(instruction)
+        or case.of_poses(names)
+        or case.of_what_would_not_show()
+        or case.right()
+    )
 
-    def given(verdict: Any, words: str, **more: Any) -> Diagnosis:
-        return Diagnosis(verdict, words, **numbers, **more)
 
-    most_px = max(most_noise_px(pairs, flow_px), harmless_px)
-    least_px = most_px if flow_px < _REST_PX else max(harmless_px, bias_px)
-    if recorded.poses is not None:  # what pictures don't show can't be told from a mistake
-        least_px = max(least_px, recorded.systematic_px()[1])
-    if alike := _likeliest(found, effects, least_px, unsure_px + bias_px):
-        texts = [each.rival.texts(each.n, width) for each in alike]
+class _Case:
+    """The pairs of a competition before their judge; what gives no verdict returns None."""
+
+    def __init__(self, found: Competition) -> None:
+        self.found, self.recorded, self.pairs = found, found.recorded, found.recorded.pairs
+        self.harmless_px = max(_HARMLESS_PX, _HARMLESS * found.flow_px)
+        self.unsure_px = 3 * self.harmless_px if found.flow_px > _REST_PX else _REST_PX
+        self.rough_px = max(most_noise_px(self.pairs, found.flow_px), self.harmless_px)
+        self.noise_px = found.noise.typical_px
+        self.effects_px = {each: each.effect_px(self.recorded) for each in found.others}
+        self.notes: list[str] = []
+        # Flow's errors that are alike in all pictures, so that more pictures don't show them.
+        is_biased = self.pairs.is_estimated
+        self.bias_px = _HARMLESS_PX + _HARMLESS * found.flow_px if is_biased else 0.0
+        self.size = f"flow: {found.flow_px:.2g} px"
+        self.unknown = f"and none of {len(found.rivals)} known mistakes explains it"
+        self.error_px = self.poses_px = math.nan
+        if self.recorded.poses is not None:
+            self.poses_px = max(self.recorded.deviation_px, *self.recorded.poses.noise_px)
+            error_px = math.hypot(*self.recorded.systematic_px, self.bias_px)
+            self.error_px = max([error_px, *self._hidden_px()])
+
+    def _hidden_px(self) -> list[float]:
+        """Returns how far explanations that data don't refute change more than their noise."""
+        noise = {"poses": self.poses_px, "flow": self.noise_px}
+        return [
+            px
+            for each, px in self.effects_px.items()
+            if each.nats > self.recorded.nats - _ALIKE
+            and self.found.is_seen(each)
+            and px > _NOISE * noise.get(each.rival.subject, 0.0)
+        ]
+
+    def _diagnosis(self, verdict: Any, words: str, **more: Any) -> Diagnosis:
+        best_px = median(middle(residuals(self.pairs, best_of(self.recorded.shown))))
+        width, others = self.pairs.now.shape[-1], self.found.others
+        rivals_px = {each.rival.texts(each.n, width)[0]: _left_px(each) for each in others}
+        return Diagnosis(
+            verdict, words, len(self.pairs.K), self.found.flow_px, _left_px(self.recorded), best_px,
+            self.error_px, self.poses_px, rivals_px, notes=tuple(self.notes), **more,
+        )  # fmt: skip
+
+    def of_a_likelier_explanation(
+        self, instruction: Callable[[str, Pairs], str]
+    ) -> Diagnosis | None:
+        """Returns the verdict if other explanations than the data as recorded are likelier."""
+        least_px = max(self.harmless_px, self.bias_px, 2 * self.noise_px * self.pairs.is_estimated)
+        if self.found.flow_px < _REST_PX:
+            least_px = max(least_px, self.rough_px)
+        if self.recorded.poses is not None:  # what pictures don't show is no mistake for certain
+            least_px = max(least_px, self.recorded.systematic_px[1])
+        vague_px = self.unsure_px + self.bias_px
+        alike = _likeliest(self.found, self.effects_px, least_px, vague_px)
+        if not alike:
+            return None
+        texts = [each.rival.texts(each.n, self.pairs.now.shape[-1]) for each in alike]
+        effects = [f"change flow by {self.effects_px[each]:.2g} px" for each in alike]
         if alike[0].rival.is_vague:
-            why = f"{texts[0][1]}, which changes flow by {effects[alike[0]]:.2g} px ({size})"
-            return given("something is wrong", f"{why}, {unknown} it better")
+            why = f"{texts[0][1]}, which would {effects[0]} ({self.size})"
+            return self._diagnosis("something is wrong", f"{why}, {self.unknown} better")
         ways = (
-            f"{said} ({instruction(remedy, each.pairs)} would change flow by "
-            f"{effects[each]:.2g} px)"
-            for each, (remedy, said) in zip(alike, texts)
+            f"{said} ({instruction(remedy, each.pairs)} would {effect})"
+            for each, (remedy, said), effect in zip(alike, texts, effects)
         )
         suspects = tuple(remedy for remedy, _ in texts)
-        return given("wrong", f"{' or '.join(ways)}; {size}", suspects=suspects)
-    notes = []
-    is_world = recorded.shown.shares.amax(0) > 0.5
-    if recorded.poses is not None and is_world.double().mean() > 0.5:
-        resolution_px = recorded.systematic_px()[1]
+        return self._diagnosis("wrong", f"{' or '.join(ways)}; {self.size}", suspects=suspects)
+
+    def of_poses(self, names: Sequence[str]) -> Diagnosis | None:
+        """Returns the verdict if recorded motions aren't those of the pictures; adds notes."""
+        poses, is_world = self.recorded.poses, self.recorded.shown.shares.amax(0) > 0.5
+        if poses is None or is_world.double().mean() <= 0.5:
+            return None
+        deviation_px, resolution_px = self.recorded.deviation_px, self.recorded.systematic_px[1]
         # A body that is hidden in the noise pulls the world's motion by about as much.
-        least_px = max(unsure_px, _NOISE * found.noise.typical_px)
-        if found.rule_nats > SURE and found.rule_px > least_px and not pairs.is_estimated:
-            why = f"errors of poses follow a rule, {found.rule_px:.2g} px ({size})"
-            return given("something is wrong", f"{why}, {unknown} it")
-        off_px, sigma_px = recorded.poses.y.norm(dim=-1), recorded.poses.sigma_px
-        if recorded.deviation_px > max(most_px, least_px, 2 * resolution_px):
-            why = f"the recorded motion is {recorded.deviation_px:.2g} px from that of the pictures"
-            return given("something is wrong", f"{why} ({size}), {unknown} it")
-        is_bad = recorded.poses.is_bad & is_world & (off_px > _NOISE * sigma_px)
-        is_bad &= off_px > max(_NOISE * recorded.deviation_px, most_px)
+        least_px = max(self.unsure_px, _NOISE * self.noise_px)
+        has_rule = self.found.rule_nats > SURE and self.found.rule_px > least_px
+        if has_rule and not self.pairs.is_estimated:
+            why = f"errors of poses follow a rule, {self.found.rule_px:.2g} px ({self.size})"
+            return self._diagnosis("something is wrong", f"{why}, {self.unknown}")
+        if deviation_px > max(self.rough_px, least_px, 2 * resolution_px):
+            why = f"the recorded motion is {deviation_px:.2g} px from that of the pictures"
+            return self._diagnosis("something is wrong", f"{why} ({self.size}), {self.unknown}")
+        off_px = poses.y.norm(dim=-1)
+        is_bad = poses.is_bad & is_world & (off_px > _NOISE * poses.sigma_px)
+        is_bad &= off_px > max(_NOISE * deviation_px, self.rough_px)
         bad = [name for name, is_one in zip(names, is_bad.tolist()) if is_one]
-        if len(bad) >= max(3, _MANY * len(names)) and not pairs.is_estimated:
+        if len(bad) >= max(3, _MANY * len(names)) and not self.pairs.is_estimated:
             why = f"poses of {len(bad)} in {len(names)} pairs don't fit: {', '.join(bad)}"
-            return given("something is wrong", why)
+            if self.recorded.is_beside_bodies:
+                return self._diagnosis("can't tell", f"{why}, or a body fills the picture")
+            return self._diagnosis("something is wrong", why)
         if bad:
-            notes.append(f"poses that don't fit the others: {', '.join(bad)}")
-        if recorded.deviation_px > max(2 * resolution_px, harmless_px):
-            notes.append("the poses are rough: motion estimated from flow and depth fits better")
-    # By the pixels, not the shares: motions that are alternatives share the same pixels.
-    explained = recorded.shown.odds.amax(0)[~pairs.depth.isnan()]
-    if pairs.by_flow and (lost := 1 - float(explained.mean())) > 0.5:
-        why = f"{lost:.0%} of pixels follow no motion, neither the camera's nor a body's"
-        return given("can't tell", why)
-    if numbers["error_px"] > unsure_px:
-        why = f"errors of up to {numbers['error_px']:.2g} px would not show ({size})"
-        if pairs.is_estimated and found.noise.typical_px > unsure_px:
-            why = f"flow estimated from the pictures has a noise of {found.noise.typical_px:.2g} px"
-            why += f" ({size}); a finer flow.preset may do better"
-        return given("can't tell", why)
-    outliers = 1 - float(recorded.shown.shares.amax(0).mean())
-    if outliers > _HARMLESS and pairs.by_flow:
-        notes.append(f"{outliers:.0%} of pixels don't fit: they move, or depth is wrong there")
-    noise = f"({size}), beside noise of {found.noise.typical_px:.2g} px"
-    if recorded.poses is None:
-        notes.append("poses, K and the unit of depth are not tested")
-        return given("right", f"one motion explains raw flow and depth {noise}", notes=tuple(notes))
-    parts = "raw flow, " * pairs.by_flow + "depth, K, the camera's motion"
-    agree = f"{parts} agree to within {numbers['error_px']:.2g} px {noise}"
-    agree += f" and poses' {numbers['rough_px']:.2g} px"
-    unseen = _unseen(pairs, rivals, max(numbers["error_px"], harmless_px))
-    return given("right", agree, unseen=unseen, notes=tuple(notes))
+            self.notes.append(f"poses that don't fit the others: {', '.join(bad)}")
+        if deviation_px > max(2 * resolution_px, self.harmless_px):
+            note = "the poses are rough: motion estimated from flow and depth fits better"
+            self.notes.append(note)
+        return None
 
+    def of_what_would_not_show(self) -> Diagnosis | None:
+        """Returns the verdict if the data would look alike with an error that matters."""
+        # By the pixels, not the shares: motions that are alternatives share the same pixels.
+        explained = self.recorded.shown.odds.amax(0)[~self.pairs.depth.isnan()]
+        lost = 1 - float(explained.mean())
+        if self.pairs.by_flow and lost > 0.5:
+            why = f"{lost:.0%} of pixels follow no motion, neither the camera's nor a body's"
+        elif not self.error_px > self.unsure_px:
+            return None
+        elif self.pairs.is_estimated and self.noise_px > self.unsure_px:
+            why = f"flow estimated from the pictures has a noise of {self.noise_px:.2g} px"
+            why += f" ({self.size}); a finer flow.preset may do better"
+        else:
+            why = f"errors of up to {self.error_px:.2g} px would not show ({self.size})"
+        return self._diagnosis("can't tell", why)
 
-def _errors_px(
-    found: Competition, effects: Mapping[Explanation, float], bias_px: float
-) -> dict[str, float]:
-    """Returns the error that data as recorded may hide, and the noise of their motions, px."""
-    recorded = found.recorded
-    if recorded.poses is None:
-        return {"error_px": math.nan, "rough_px": math.nan}
-    rough_px = max(recorded.deviation_px, *recorded.poses.noise_px)
-    noise = {"poses": rough_px, "flow": found.noise.typical_px}
-    # What the data don't refute may be so, unless it is their noise that changes.
-    hidden = [
-        effects[each]
-        for each in found.others
-        if each.nats > recorded.nats - _ALIKE
-        and found.is_seen(each)
-        and effects[each] > _NOISE * noise.get(each.rival.subject, 0.0)
-    ]
-    error_px = math.hypot(*recorded.systematic_px(), bias_px)
-    return {"error_px": max([error_px, *hidden]), "rough_px": rough_px}
+    def right(self) -> Diagnosis:
+        """Returns the verdict if nothing speaks against the data."""
+        outliers = 1 - float(self.recorded.shown.shares.amax(0).mean())
+        if outliers > _HARMLESS and self.pairs.by_flow:
+            note = f"{outliers:.0%} of pixels don't fit: they move, or depth is wrong there"
+            self.notes.append(note)
+        noise = f"({self.size}), beside noise of {self.noise_px:.2g} px"
+        if self.recorded.poses is None:
+            self.notes.append("poses, K and the unit of depth are not tested")
+            return self._diagnosis("right", f"one motion explains raw flow and depth {noise}")
+        parts = "raw flow, " * self.pairs.by_flow + "depth, K, the camera's motion"
+        words = f"{parts} agree to within {self.error_px:.2g} px {noise}"
+        words += f" and poses' {self.poses_px:.2g} px"
+        unseen = _unseen(self.pairs, self.found.rivals, max(self.error_px, self.harmless_px))
+        return self._diagnosis("right", words, unseen=unseen)
 
 
 def _likeliest(
@@ -239,5 +276,5 @@ def _unseen(pairs: Pairs, rivals: Sequence[Rival], least: float) -> tuple[str, .
             other = rival.change(pairs, now.new_tensor(rival.usual).expand(len(now), -1))
             apart = length(residuals(other, other.motion) - now)
             if median(apart.nanmedian(-1).values) <= least:
-                unseen.append(rival.remedy.partition("={")[0].partition("=[")[0].partition(" {")[0])
+                unseen.append(rival.name)
     return tuple(unseen)
