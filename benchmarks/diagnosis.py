@@ -152,12 +152,9 @@ def with_least_shown(shots: Shots, seed: int) -> tuple[Shots, float]:
             module.Competition = kept
     if not seen:
         return shots, 0.0
-    recorded, pair = seen[0].recorded, torch.arange(len(seen[0].recorded.shown.nats))
-    known, root = (
-        x[recorded.poses.mode, pair] for x in (recorded.metric.known, recorded.metric.root)
-    )
-    least = torch.linalg.eigh(known.sum(0))[1][:, 0]
-    step = torch.linalg.solve(root.mean(0), least)
+    by = seen[0].recorded.poses.by
+    least = torch.linalg.eigh(by.information.sum(0))[1][:, 0]
+    step = torch.linalg.solve(by.root.mean(0), least)
     r = np.random.default_rng([72, seed])
     size = r.uniform(0.02, 0.3) * seen[0].flow_px * r.choice([-1, 1])
     D, poses = small_motion(size * step).numpy(), [shots.poses[0]]

@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from flowrep.diagnosis import explanation, fit, pictures
+from flowrep.diagnosis import explanation, fit, pictures, poses
 from flowrep.diagnosis.candidates import Candidate, candidate
 from flowrep.diagnosis.explanation import Explanation
 from flowrep.diagnosis.fit import EYE, Pairs, flow_of, length, median, residuals
@@ -34,7 +34,7 @@ class Competition:
         still: that the camera stands still.
         noise: that of all explanations.
         flow_px: the median length of flow.
-        rule_px: the errors of poses that a rule predicts, see `explanation.by_a_rule`.
+        rule_px: the errors of poses that a rule predicts, see `poses.by_a_rule`.
         rule_nats: what speaks for the rule.
     """
 
@@ -65,7 +65,7 @@ class Competition:
         noises = (_noise(each.pairs, own) for each, own in zip([*nulls, *of_data], motions))
         self.noise = min(noises, key=lambda each: float(each.px.log().mean()))
         least_px = 1e-3 if pairs.by_flow else 1e-2
-        most_px = max(explanation.most_noise_px(pairs, self.flow_px), 2 * least_px)
+        most_px = max(poses.most_noise_px(pairs, self.flow_px), 2 * least_px)
         self._limits = self.flow_px, least_px, most_px
         explained = [self._explained(*both) for both in zip([*nulls, *of_data], motions)]
         self.recorded, *self.others = explained
@@ -74,9 +74,9 @@ class Competition:
         self.still = self._of_poses(still) if pairs.has_poses else None
         self.rule_px = self.rule_nats = 0.0
         if self.recorded.poses is not None and len(pairs.K) >= 8:
-            rule = explanation.by_a_rule(self.recorded)
             shown, metric = self.recorded.shown, self.recorded.metric
-            after = explanation.poses(pairs.motion, shown, metric, *self._limits, rule)
+            rule = poses.by_a_rule(self.recorded.poses, shown)
+            after = poses.compared(pairs.motion, shown, metric, *self._limits, rule)
             self.rule_px = median(rule.norm(dim=-1))
             self.rule_nats = explanation.agreed(after.nats - self.recorded.poses.nats)
 
@@ -105,10 +105,10 @@ class Competition:
         return found
 
     def _scored(self, by: Candidate, shown: Mixture, metric: Metric) -> Explanation:
-        poses, n = None, by.n.nanmedian(0).values
+        of_poses, n = None, by.n.nanmedian(0).values
         if self._has_poses:
-            poses = explanation.poses(by.pairs.motion, shown, metric, *self._limits)
-        return Explanation(by.rival, n, by.pairs, shown, metric, poses, by.surprise)
+            of_poses = poses.compared(by.pairs.motion, shown, metric, *self._limits)
+        return Explanation(by.rival, n, by.pairs, shown, metric, of_poses, by.surprise)
 
 
 def _in_both_pictures(pairs: Pairs) -> Pairs:

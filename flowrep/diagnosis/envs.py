@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from flowrep import geometry
-from flowrep.diagnosis import explanation, pictures
+from flowrep.diagnosis import explanation, pictures, poses
 from flowrep.diagnosis.competition import Competition
 from flowrep.diagnosis.fit import (
     EYE,
@@ -303,7 +303,7 @@ def _bodies(seen: _Seen) -> tuple[str, str]:
     exact = pictures.mixture(pairs, pairs.motion.unsqueeze(0), competition.noise)
     best = flow_of(pairs, pictures.best_of(shown))
     off_px = median(middle(best - flow_of(pairs, pairs.motion)))
-    most_px = explanation.most_noise_px(pairs, competition.flow_px)
+    most_px = poses.most_noise_px(pairs, competition.flow_px)
     gain = explanation.agreed(shown.nats - exact.nats)
     if gain > max(explanation.SURE, 5 * len(bodies)) and off_px > most_px:  # 5 nats for each
         why = f"another motion, {off_px:.2g} px from theirs, fits their pixels better"

@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from flowrep.diagnosis.competition import Competition
-from flowrep.diagnosis.explanation import SURE, Explanation, most_noise_px
+from flowrep.diagnosis.explanation import SURE, Explanation
 from flowrep.diagnosis.fit import Pairs, length, median, middle, residuals
 from flowrep.diagnosis.pictures import best_of
+from flowrep.diagnosis.poses import most_noise_px
 from flowrep.diagnosis.rivals import Rival
 
 # An error that is smaller than one of these does nobody harm; one of three times that is no longer
