@@ -130,7 +130,8 @@ def _first_look(pairs: Pairs, rivals: Sequence[Rival]) -> tuple[Tensor, Mixture,
     starts = _starts(pairs, closed)
     starts = fit.refined(pairs, starts, _noise(pairs, starts).px)
     shown = pictures.mixture(pairs, starts, _noise(pairs, starts))
-    return starts, shown, pictures.learnt_noise(pairs, _left(pairs, starts, shown))
+    left = _of_likeliest(residuals(pairs, starts), shown, 0.3)
+    return starts, shown, pictures.learnt_noise(pairs, left)
 
 
 def _motions(
@@ -176,30 +177,26 @@ def _shown_by(pairs: Pairs, shown: Mixture, noise: Noise) -> Tensor:
     size = length(residuals(pairs, found)).nan_to_num(math.inf)
     near = size.nanquantile(0.2, -1, keepdim=True).argmin(0, keepdim=True)
     left = size.gather(0, near.expand(1, *size.shape[1:]))[0] > 5 * noise.px
-    other = motion_of_points(*_points(pairs), left).unsqueeze(0)
-    return torch.cat([found, fit.refined(pairs, other, noise.px, 4)])
+    return torch.cat([found, _of_body(pairs, left, noise)])
 
 
 def _beside_bodies(pairs: Pairs, noise: Noise) -> Mixture:
     """Returns the recorded motions beside others: bodies pull fits of the world to them."""
     motion = torch.where(pairs.motion.isfinite(), pairs.motion, EYE)
     left = length(residuals(pairs, motion)) > 2 * noise.px
-    other = motion_of_points(*_points(pairs), left).unsqueeze(0)
-    other = fit.refined(pairs, other, noise.px, 4)
-    return pictures.mixture(pairs, torch.cat([motion.unsqueeze(0), other]), noise)
+    motions = torch.cat([motion.unsqueeze(0), _of_body(pairs, left, noise)])
+    return pictures.mixture(pairs, motions, noise)
+
+
+def _of_body(pairs: Pairs, left: Tensor, noise: Noise) -> Tensor:
+    """Returns a motion `[1, P, 4, 4]` of the pixels that are left."""
+    return fit.refined(pairs, motion_of_points(*_points(pairs), left).unsqueeze(0), noise.px, 4)
 
 
 def _nearest(pairs: Pairs, pool: Tensor) -> Tensor:
     """Returns the two motions of a pool that leave least of many pixels, for each pair."""
     size = length(residuals(pairs.few, pool)).nanquantile(0.3, -1).nan_to_num(math.inf)
     return pool[size.argsort(0)[:2], torch.arange(pool.shape[1])]
-
-
-def _left(pairs: Pairs, motions: Tensor, shown: Mixture) -> Tensor:
-    """Returns the residuals `[P, C, N]` of each pixel's likeliest motion, nan of outliers."""
-    rest, likely = residuals(pairs, motions), shown.odds.max(0)
-    rest = rest.gather(0, likely.indices[None, :, None].expand(1, -1, rest.shape[2], -1))[0]
-    return torch.where(likely.values.unsqueeze(1) > 0.3, rest, math.nan)
 
 
 def _noise(pairs: Pairs, motions: Tensor) -> Noise:
@@ -209,12 +206,18 @@ def _noise(pairs: Pairs, motions: Tensor) -> Noise:
     return pictures.learnt_noise(pairs, rest[near, torch.arange(len(near))])
 
 
+def _of_likeliest(maps: Tensor, shown: Mixture, least: float) -> Tensor:
+    """Returns maps `[M, P, C, N]` by each pixel's likeliest motion, nan if its odds are less."""
+    odds, motion = shown.odds.max(0)
+    own = maps.gather(0, motion[None, :, None].expand(1, -1, maps.shape[2], -1))[0]
+    return torch.where(odds.unsqueeze(1) > least, own, math.nan)
+
+
 def _smooth(pairs: Pairs, shown: Mixture) -> Tensor:
     """Returns raw flow without its noise, where a motion explains it."""
     flow = flow_of(pairs, torch.where(shown.motions.isfinite(), shown.motions, EYE))
-    likely = shown.odds.max(0)
-    flow = flow.gather(0, likely.indices[None, :, None].expand(1, -1, 2, -1))[0]
-    return torch.where(likely.values.unsqueeze(1) > 0.5, flow, pairs.shift)
+    flow = _of_likeliest(flow, shown, 0.5)
+    return torch.where(flow.isnan(), pairs.shift, flow)
 
 
 def _points(pairs: Pairs) -> tuple[Tensor, Tensor, Tensor, Tensor]:

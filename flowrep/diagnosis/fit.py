@@ -43,11 +43,9 @@ class Pairs(NamedTuple):
     by_flow: bool  # whether the reference is raw flow, not the depth of the previous frame
     is_estimated: bool  # whether flow was estimated from pictures
     focal_px: float  # as recorded: residuals of depth are in it, whatever K a rival tries
-    gain: Tensor = torch.eye(2, dtype=torch.float64)  # [(P,) 2, 2], raw is this times flow
-    distortion: Tensor = torch.zeros(1, 1, dtype=torch.float64)  # [P, 1], of the radius' square
-    stretch: Tensor = torch.ones(
-        1, 1, dtype=torch.float64
-    )  # [P, N], depth's growth per that stored
+    gain: Tensor = torch.eye(2).double()  # [(P,) 2, 2], raw is this times flow
+    distortion: Tensor = torch.zeros(1, 1).double()  # [P, 1], of the radius' square
+    stretch: Tensor = torch.ones(1, 1).double()  # [P, N], depth's growth per that stored
     grain: float = 0.0  # noise of inverse depth from pixel to pixel, as a share of it
     smooth: Tensor | None = None  # [P, 2, N], raw flow without noise, where a motion explains it
 
@@ -260,14 +258,19 @@ def gauss_newton(
     k, first = n.shape[1], n
     tries = _STEP * torch.cat([torch.zeros(1, k), torch.eye(k)]).double().unsqueeze(1)
     best, least = n, torch.full((len(n),), math.inf, dtype=torch.float64)
+
+    def summed(of_pairs: Tensor) -> Tensor:
+        zeros = torch.zeros(len(n), *of_pairs.shape[1:], dtype=torch.float64)
+        return zeros.index_add(0, group, of_pairs)
+
     for step in range(steps + 1):
         r, *columns = residuals_of(n[group] + tries)
         squared = (r / noise.unsqueeze(1)).square().sum(1)
         cost = squared.log1p().nanmean(-1)
-        per_group = torch.zeros(len(n)).double().index_add(0, group, cost.nan_to_num(1e3))
-        is_better, fell = per_group < least, least - per_group
+        total = summed(cost.nan_to_num(1e3))
+        is_better, fell = total < least, least - total
         best = torch.where(is_better.unsqueeze(-1), n, best)
-        least = per_group.minimum(least)
+        least = total.minimum(least)
         if step == steps or (step > 1 and bool((fell < 1e-3 * len(cost) / len(n)).all())):
             break
         near = squared.nanquantile(_NEAREST, -1, keepdim=True).nan_to_num(1.0) * 8
@@ -276,19 +279,11 @@ def gauss_newton(
         known = (r.isfinite() & J.isfinite().all(-1)).all(1)
         weight = 1 / (1 + squared / scale) / noise
         weight = torch.where(known & weight.isfinite(), weight, 0.0).unsqueeze(1)
-        r, J = (
-            (r.nan_to_num() * weight).flatten(1),
-            (J.nan_to_num() * weight.unsqueeze(-1)).flatten(1, 2),
-        )
+        r = (r.nan_to_num() * weight).flatten(1).unsqueeze(-1)
+        J = (J.nan_to_num() * weight.unsqueeze(-1)).flatten(1, 2)
         # The prior of numbers: normal, about 1 from where they started.
-        A = torch.eye(k).double() + torch.zeros(len(n), k, k).double().index_add(0, group, J.mT @ J)
-        b = (
-            n
-            - first
-            + torch.zeros(len(n), k)
-            .double()
-            .index_add(0, group, (J.mT @ r.unsqueeze(-1)).squeeze(-1))
-        )
+        A = torch.eye(k).double() + summed(J.mT @ J)
+        b = n - first + summed((J.mT @ r).squeeze(-1))
         # In units in which all unknowns change the residuals alike; damped where none does.
         unit = A.diagonal(dim1=-2, dim2=-1).clamp(min=1e-12).rsqrt()
         A = A * unit.unsqueeze(-1) * unit.unsqueeze(-2) + 1e-6 * torch.eye(k)
@@ -300,21 +295,19 @@ def gauss_newton(
 
 def refined(pairs: Pairs, motions: Tensor, noise: Tensor, steps: int = 6) -> Tensor:
     """Returns the motions `[M, P, 4, 4]` of small residuals that are next to these."""
-    few, noise = pairs.few, noise[:, :_FITTED]
-    count, (M, P) = _FITTED, motions.shape[:2]
+    few, noise, (M, P) = pairs.few, noise[:, :_FITTED], motions.shape[:2]
     known = motions.isfinite().flatten(-2).all(-1)
     start = torch.where(known[..., None, None], motions, EYE)
     # Translations are in units of the depth, so that all numbers are about as large.
     unit = torch.ones(6).double()
     unit[3:] = few.depth[few.depth.isfinite()].abs().median().clamp(1e-6, 1e6)
 
-    def residuals_of(n: Tensor) -> Tensor:
-        moved = small_motion(n.unflatten(-2, (M, P)) * unit) @ start
-        r = residuals(few, moved)
-        return r.flatten(-4, -3)
+    def moved(n: Tensor) -> Tensor:
+        return small_motion(n.unflatten(-2, (M, P)) * unit) @ start
 
     zeros, group = torch.zeros(M * P, 6).double(), torch.arange(M * P)
-    n, _ = gauss_newton(residuals_of, zeros, group, noise.repeat(M, 1)[:, :count], steps=steps)
-    return torch.where(
-        known[..., None, None], small_motion(n.view(M, P, 6) * unit) @ start, motions
-    )
+    n, _ = gauss_newton(
+        lambda n: residuals(few, moved(n)).flatten(-4, -3), zeros, group, noise.repeat(M, 1),
+        steps=steps,
+    )  # fmt: skip
+    return torch.where(known[..., None, None], moved(n), motions)
