@@ -24,7 +24,7 @@ from tensordict import TensorDict
 if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.mistakes import drawn
+from benchmarks.mistakes import LISTED, TWO, drawn
 from benchmarks.shots import Array, Shots, draw, flow_of, frames_of
 
 
@@ -219,7 +219,7 @@ def main() -> None:
         seconds.append(spent)
         route, share = shots.kind[2], "< 50 % moving" if shots.moving < 0.5 else ">= 50 %"
         if name:
-            mistakes[kind] += 1
+            mistakes["listed" if name in {**LISTED, **TWO} else "unlisted", kind] += 1
             kinds[f"{name:32}", kind] += 1
         else:
             noise = "noisy poses" if "poses" in shots.kind else "exact poses"
@@ -236,9 +236,10 @@ def main() -> None:
             for kind in ("called wrong", "can't tell")
         ]
         print(f"{group:44}", "; ".join(line))
-    total = sum(n for kind, n in mistakes.items() if kind != "no effect")
-    for kind in ("named", "noticed", "misnamed", "can't tell", "within", "passed"):
-        print(f"mistakes {kind:12} {wilson(mistakes[kind], total)}")
+    for group in ("listed", "unlisted"):
+        total = sum(n for (g, kind), n in mistakes.items() if g == group and kind != "no effect")
+        for kind in ("named", "noticed", "misnamed", "can't tell", "within", "passed"):
+            print(f"{group} mistakes {kind:12} {wilson(mistakes[group, kind], total)}")
     for name in sorted({name for name, _ in kinds}):
         print("  ", name, {kind: n for (m, kind), n in kinds.items() if m == name})
     print(
