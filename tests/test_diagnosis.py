@@ -21,6 +21,7 @@ from benchmarks.mistakes import FLU, LISTED, OPENGL, UNLISTED
 from benchmarks.shots import draw, frames_of
 from flowrep import diagnose, diagnosis, geometry, transforms
 from flowrep.diagnosis import Examination
+from flowrep.diagnosis.explanation import agreed
 from flowrep.diagnosis.rivals import rivals_of
 
 drawn = cache(draw)
@@ -52,6 +53,31 @@ def test_a_camera_at_rest_with_rough_poses_is_right_since_flow_is_noise():
 def test_the_recorded_motion_may_be_that_of_fewer_than_half_of_the_pixels():
     assert drawn(30046).moving > 0.55
     assert found_of(drawn(30046)).is_right
+
+
+def test_pairs_in_which_a_body_fills_the_picture_are_no_mistake():
+    found = found_of(drawn(53))
+    assert found.verdict == "can't tell"
+    assert "6, 7, 8, or a body fills the picture" in found.words
+
+
+def test_only_nats_on_which_pairs_agree_count():
+    # The sum of twelve fours is 48; twelve of 14 and -6 have it too, but a deviation of 10 each,
+    # clamped to 10 and -6: 24 less 2 √12 8.
+    assert agreed(torch.full((12,), 4.0)) == pytest.approx(48)
+    assert agreed(torch.tensor([14.0, -6.0] * 6)) == pytest.approx(24 - 2 * 12**0.5 * 8)
+    assert agreed(torch.tensor([100.0])) == 50  # a single pair may decide
+
+
+def test_noise_of_poses_cancels_over_successive_pairs_and_a_drift_does_not():
+    random, right = np.random.default_rng(1), drawn(ROOM)
+    noise = random.normal(0, 0.004, (len(right.poses), 3))
+    rough, drifting = right.poses.copy(), right.poses.copy()
+    rough[:, :3, 3] += noise
+    drifting[:, :3, 3] += noise.cumsum(0)
+    of_poses, of_motions = (examined(right.with_(poses=poses)) for poses in (rough, drifting))
+    assert of_poses.is_right
+    assert of_poses.error_px < 0.5 * of_motions.error_px
 
 
 def test_flow_that_mostly_follows_no_motion_is_not_called_right():
