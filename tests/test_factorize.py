@@ -310,16 +310,6 @@ def test_a_format_gives_options_of_its_reader_and_the_plain_layout_all(name):
             open_stream(settings(*(text for text in given if not text.startswith(f"format.{key}"))))
 
 
-def test_the_command_ends_with_one_line_and_code_2(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["train", "format=tum", "input=nowhere", "output=out"])
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 2
-    assert re.fullmatch(r"error: .*nowhere.*\n", capsys.readouterr().err)
-    assert list(tmp_path.iterdir()) == []
-
-
 def run(monkeypatch, *arguments) -> int:
     monkeypatch.setattr(sys, "argv", ["factorize", *arguments])
     with pytest.raises(SystemExit) as ended:
