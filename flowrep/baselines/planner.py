@@ -140,7 +140,9 @@ class _Search:
 
     def __init__(self, episode: Episode, crowd: Crowd) -> None:
         self.episode, self.crowd = episode, crowd
-        self.vehicle = episode.layout.scene.vehicle
+        scene = episode.layout.scene
+        self.vehicle = scene.vehicle
+        self.person_radius_m = scene.pedestrian_size * PERSON_RADIUS_M
         self.free, self.way = _ground(episode.layout, episode.path)
 
     def run(self, beam: int, margin_m: float) -> tuple[list[int], bool]:
@@ -209,4 +211,4 @@ class _Search:
         ahead = np.abs(cosine * dx + sine * dy) - self.vehicle.length_m / 2
         aside = np.abs(cosine * dy - sine * dx) - self.vehicle.width_m / 2
         gap = np.hypot(np.maximum(ahead, 0.0), np.maximum(aside, 0.0))
-        return (gap < PERSON_RADIUS_M + margin_m).any(axis=-1)
+        return (gap < self.person_radius_m + margin_m).any(axis=-1)

@@ -85,7 +85,7 @@ class Sensing:
             now = self._camera_poses([episode.now for episode in episodes])
             before = self._camera_poses([episode.before for episode in episodes])
             if "instance_motion" in self.names:
-                parts_before = world_from_parts(np.stack([e.poses_before for e in episodes]))
+                parts_before = self._parts([episode.poses_before for episode in episodes])
                 # Composed in float64 and rounded once. Row 0 is copied, so that it is contiguous.
                 rows = instance_motion(before, now, parts_before, views[1]).astype(np.float32)
                 observation |= {"instance_motion": rows, "prev_from_curr": rows[:, 0].copy()}
@@ -130,9 +130,12 @@ class Sensing:
         """Returns cam_from_world, the poses of people's parts, and which bodies exist, [N, ...]."""
         return (
             rigid_inverse(self._camera_poses([episode.now for episode in episodes])),
-            world_from_parts(np.stack([episode.poses for episode in episodes])),
+            self._parts([episode.poses for episode in episodes]),
             np.stack([self._street.is_shown(episode.path.closures) for episode in episodes]),
         )
+
+    def _parts(self, poses: Sequence[Array]) -> Array:
+        return world_from_parts(np.stack(poses), self._scene.pedestrian_size)
 
     def _rasteriser(self, scale: int) -> Any:
         """Returns the rasteriser of pictures of `scale` times the maps' size."""

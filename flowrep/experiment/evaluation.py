@@ -308,5 +308,8 @@ class PairedEvaluation:
 
 def scene_id(scene: Scene) -> str:
     """Returns a short hash of all that defines a scene."""
-    text = json.dumps(asdict(scene), sort_keys=True)
+    data = asdict(scene)
+    if scene.pedestrian_size == 1.0:  # the key is younger than the ids in stored tables
+        del data["pedestrian_size"]
+    text = json.dumps(data, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:8]

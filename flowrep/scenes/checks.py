@@ -136,7 +136,8 @@ def check_path(layout: Layout, path: Path) -> None:
 
 def check_walks(layout: Layout) -> None:
     """Checks that people never overlap a box, another person or the start of the vehicle."""
-    reach, least = pedestrians.RADIUS_M, pedestrians.APART_M
+    size = layout.scene.pedestrian_size
+    reach, least = size * pedestrians.RADIUS_M, size * pedestrians.APART_M
     grounds = {group.name: _ground(layout, group) for group in layout.scene.pedestrian_groups}
     boxes = [*layout.buildings, *layout.obstacles, *layout.closures.values()]
     tree = shapely.STRtree([box.footprint for box in boxes])
@@ -160,13 +161,14 @@ def check_walks(layout: Layout) -> None:
         if (gap := ground.distance(other_ground)) < least:
             raise SceneError(
                 f"pedestrian_groups.{one}: people of {other!r} come within {gap:.2f} m of those of "
-                f"this group; keep the walks {least} m apart: move one, or narrow its spread_m"
+                f"this group; keep the walks {least:g} m apart: move one, or narrow its spread_m"
             )
 
 
 def _ground(layout: Layout, group: PedestrianGroup) -> list[shapely.Geometry]:
     key, spread = f"pedestrian_groups.{group.name}", group.spread_m
-    if spread < (least := pedestrians.least_spread_m(group.count)):
+    size = layout.scene.pedestrian_size
+    if spread < (least := pedestrians.least_spread_m(group.count, size)):
         raise SceneError(
             f"{key}.spread_m: is {spread}, but {group.count} people need lanes {least:.2f} m wide "
             f"together; give {least:.2f} or more"
@@ -176,7 +178,9 @@ def _ground(layout: Layout, group: PedestrianGroup) -> list[shapely.Geometry]:
         raise SceneError(f"{key}.walk: has no length; give two points apart from each other")
     # Only the walk of a single person may cross itself; where lanes cross, two people could meet.
     is_walkable = all(pedestrians.keeps_its_stretches(line, side * spread / 2) for side in (-1, 1))
-    if not is_walkable or (group.count > 1 and not pedestrians.keeps_lanes_apart(line, spread)):
+    if group.count > 1:
+        is_walkable = is_walkable and pedestrians.keeps_lanes_apart(line, spread, size)
+    if not is_walkable:
         raise SceneError(
             f"{key}.walk: comes too near to itself, or bends too sharply, for lanes {spread} m "
             "wide; stretch or straighten the walk, or give fewer people and a smaller spread_m"

@@ -16,16 +16,16 @@ from flowrep.scenes.scene import Range
 
 Array = NDArray[Any]
 
-RADIUS_M, HEIGHT_M = 0.3, 1.75  # of the collision cylinder
+RADIUS_M, HEIGHT_M = 0.3, 1.75  # of the collision cylinder; as all lengths, of people of size 1
 APART_M = 2 * RADIUS_M  # distance between the centres of two people who touch
-LANE_M = APART_M + 0.01  # least distance between lanes; with rounding, people still don't touch
+_BESIDE_M = 0.01  # between people on neighbouring lanes; with rounding, they still don't touch
 PARTS = ("upper body", "left leg", "right leg")
 HIP_M = 0.82  # height of the hips
 _HIP_ASIDE_M = 0.1  # their distance from the middle
 _SIDES = np.array([1.0, -1.0])  # of the legs: left is +y
 
 
-def world_from_parts(poses: Array) -> Array:
+def world_from_parts(poses: Array, size: float) -> Array:
     """Returns the parts of people at poses [..., P, 4] as transforms [..., 3·P, 4, 4]."""
     x, y, yaw, swing = np.moveaxis(poses, -1, 0)[..., None]
     transforms = np.zeros((*poses.shape[:-1], len(PARTS), 4, 4))
@@ -41,10 +41,10 @@ def world_from_parts(poses: Array) -> Array:
     transforms[..., 1, 2] = sine * sine_y
     transforms[..., 2, 0] = -sine_y
     transforms[..., 2, 2] = cosine_y
-    aside = np.array([0.0, *(_HIP_ASIDE_M * _SIDES)])
+    aside = size * np.array([0.0, *(_HIP_ASIDE_M * _SIDES)])
     transforms[..., 0, 3] = x - sine * aside
     transforms[..., 1, 3] = y + cosine * aside
-    transforms[..., 1:, 2, 3] = HIP_M
+    transforms[..., 1:, 2, 3] = size * HIP_M
     transforms[..., 3, 3] = 1.0
     return transforms.reshape(*poses.shape[:-2], -1, 4, 4)
 
@@ -57,12 +57,13 @@ def keeps_its_stretches(points: Array, aside_m: float) -> bool:
     return bool(((steps * moved).sum(axis=-1) > SHORTEST_M * np.hypot(*steps.T)).all())
 
 
-def keeps_lanes_apart(points: Array, spread_m: float) -> bool:
+def keeps_lanes_apart(points: Array, spread_m: float, size: float) -> bool:
     """Returns whether the lanes within `spread_m` keep their distances all along a walk."""
     # They do if the strip of all lanes, widened by half of the distance that people keep, doesn't
     # overlap itself: one can then get from one lane to another only across all lanes in between, or
     # by leaving the strip.
-    reach, room = spread_m / 2 + APART_M / 2, APART_M / 2
+    room = size * APART_M / 2
+    reach = spread_m / 2 + room
     first, last = points[1] - points[0], points[-1] - points[-2]
     longer = points.astype(np.float64)
     longer[0] -= room * first / np.hypot(*first)
@@ -80,18 +81,19 @@ def covered_ground(points: Array, spread_m: float) -> list[shapely.Geometry]:
     return list(shapely.convex_hull(shapely.multipoints(corners)))
 
 
-def least_spread_m(count: int) -> float:
+def least_spread_m(count: int, size: float) -> float:
     """Returns the least `spread_m` that the lanes of `count` people need."""
-    return round((count - 1) * LANE_M, 6)
+    return round((count - 1) * (size * APART_M + _BESIDE_M), 6)
 
 
-def draw_lanes(count: int, spread_m: float, rng: np.random.Generator) -> Array:
+def draw_lanes(count: int, spread_m: float, size: float, rng: np.random.Generator) -> Array:
     """Returns each person's lane [P] as its distance in metres to the left of the walk."""
-    # All placements within `spread_m` that are at least `LANE_M` apart are equally likely, and so
+    # All placements within `spread_m` at which people don't touch are equally likely, and so
     # are all orders of the people. To draw one without rejection: subtract the required distances
     # from the width, draw sorted uniform numbers in what is left, and add the distances again.
-    free = max(spread_m - least_spread_m(count), 0.0)
-    lanes = np.sort(rng.uniform(0.0, 1.0, count)) * free + LANE_M * np.arange(count)
+    free = max(spread_m - least_spread_m(count, size), 0.0)
+    apart_m = size * APART_M + _BESIDE_M
+    lanes = np.sort(rng.uniform(0.0, 1.0, count)) * free + apart_m * np.arange(count)
     return rng.permutation(lanes - spread_m / 2)
 
 
@@ -184,6 +186,7 @@ def draw_crowd(layout: Layout, speed_mps: Range, rng: np.random.Generator) -> Cr
     """Returns a crowd with phases, directions, speeds and lanes drawn for one episode."""
     lines: list[Array] = []
     speeds, phases = [np.empty(0)], [np.empty(0)]
+    size = layout.scene.pedestrian_size
     for group in layout.scene.pedestrian_groups:
         low, high = group.speed_mps or speed_mps
         draws = 1 if group.draw == "group" else group.count
@@ -191,7 +194,7 @@ def draw_crowd(layout: Layout, speed_mps: Range, rng: np.random.Generator) -> Cr
         # people share phase and speed, and start up to half of `spread_m` ahead or behind.
         phase = np.resize(rng.uniform(0.0, 1.0, draws), group.count)
         speed = np.resize(rng.uniform(low, high, draws), group.count)
-        lateral = draw_lanes(group.count, group.spread_m, rng)
+        lateral = draw_lanes(group.count, group.spread_m, size, rng)
         ahead = rng.uniform(-0.5, 0.5, group.count) * group.spread_m
         lanes = [layout.walk_line(group.walk, aside) for aside in lateral.tolist()]
         there_and_back = [2 * np.hypot(*np.diff(lane, axis=0).T).sum() for lane in lanes]

@@ -451,6 +451,8 @@ class Scene(Part):
     paths: Annotated[Parts[Path], Field(min_length=1), AfterValidator(_named_once)]
     pedestrian_speed_mps: Annotated[dict[SpeedMode, SpeedRange], AfterValidator(_all_modes)]
     """[lowest, highest] speed of people in each of the modes low, normal and high."""
+    pedestrian_size: Annotated[float, Strict(), Field(ge=0.1, le=3.0)] = 1.0
+    """Size of people: at 1 they are 1.75 m tall, and 0.6 m wide with swinging arms."""
     pedestrian_groups: Annotated[Parts[PedestrianGroup], AfterValidator(_named_once)] = ()
     building_rows: Parts[BuildingRow] = ()
     obstacles: tuple[Obstacle, ...] = ()

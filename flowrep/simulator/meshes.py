@@ -113,6 +113,14 @@ class Mesh:
         corners, paints, texels = map(np.concatenate, zip(*self._parts))
         return corners, paints, texels
 
+    def scaled(self, factor: float) -> "Mesh":
+        """Returns the mesh at `factor` times its size about the origin."""
+        mesh = Mesh()
+        mesh._parts = [
+            (factor * corners, paints, texels) for corners, paints, texels in self._parts
+        ]
+        return mesh
+
     def polygon(self, corners: Array, patch: Patch, texels: Any = None) -> None:
         """Adds a flat convex polygon [M, 3], counter-clockwise seen from outside."""
         # A fan of triangles from the first corner, which is only right for convex polygons.
@@ -325,7 +333,7 @@ def _ring(sides: int, radius_m: float, z: float) -> Array:
     return np.stack([x, y, np.full(sides, z)], axis=-1)
 
 
-def person_meshes(variant: int) -> tuple[Mesh, ...]:
+def person_meshes(variant: int, size: float) -> tuple[Mesh, ...]:
     """Returns the meshes of a person's `PARTS`, facing along x; the origin of a leg is its hip.
 
     They stand in the cylinder that collides, whose size is in `flowrep.scenes.pedestrians`.
@@ -346,4 +354,4 @@ def person_meshes(variant: int) -> tuple[Mesh, ...]:
         leg.box((-0.1, -0.08, -HIP_M + 0.1), (0.1, 0.08, 0.02), swatch("trousers"), lid=False)
         leg.box((-0.1, -0.08, -HIP_M), (0.2, 0.08, -HIP_M + 0.1), swatch("shoe"))
         legs.append(leg)
-    return (body, *legs)
+    return tuple(mesh.scaled(size) for mesh in (body, *legs))

@@ -60,9 +60,11 @@ class Street:
         self.simulator = Simulator()
         self.bodies: list[Body] = []
         vehicle, count = layout.scene.vehicle, layout.scene.num_pedestrians
+        size = layout.scene.pedestrian_size
+        radius_m, height_m = size * pedestrians.RADIUS_M, size * pedestrians.HEIGHT_M
         self._vehicle = self.simulator.add_box(vehicle.length_m, vehicle.width_m, vehicle.height_m)
         # A single cylinder serves all people: it is placed wherever the vehicle may touch a person.
-        self._person = self.simulator.add_cylinder(pedestrians.RADIUS_M, pedestrians.HEIGHT_M)
+        self._person = self.simulator.add_cylinder(radius_m, height_m)
         self._boxes: list[tuple[Box, int]] = []  # all that can be hit, each with its solid
         self._add_ground(layout)
         self._add_solids([*layout.buildings, *layout.obstacles])
@@ -70,12 +72,12 @@ class Street:
         for name, box in layout.closures.items():
             mesh = meshes.mesh_of(box, both_sides=True)
             self._closures[name] = len(self.bodies), self._add_solid([box], mesh)
-        parts = [mesh for i in range(count) for mesh in person_meshes(i)]
+        parts = [mesh for i in range(count) for mesh in person_meshes(i, size)]
         for instance, mesh in enumerate(parts, start=1):
             self._add_body(mesh, "pedestrian", instance)
         self.triangles = gather(self.bodies)
         reach_m = math.hypot(vehicle.length_m, vehicle.width_m) / 2
-        self._person_reach_m = reach_m + pedestrians.RADIUS_M
+        self._person_reach_m = reach_m + radius_m
         self._solids = np.array([solid for _, solid in self._boxes], dtype=int)
         self._category_of = {solid: box.category for box, solid in self._boxes}
         self._centres = np.array([(box.x_m, box.y_m) for box, _ in self._boxes]).reshape(-1, 2)

@@ -13,6 +13,7 @@ pytest.importorskip("pybullet", reason="policies drive the simulated street")
 from flowrep.agent.networks import DiscreteActions, stochastic_policy
 from flowrep.envs import make_env
 from flowrep.experiment.evaluation import PairedEvaluation, evaluate, scene_id
+from flowrep.scenes import load_scene
 
 NO_OP = 0
 NOISE = {"depth_sigma_per_m": 0.01, "depth_dropout": 0.1, "drift_m": 0.05, "drift_rad": 0.01}
@@ -207,4 +208,6 @@ def test_each_finished_group_is_saved_before_the_next_begins(scene):
 def test_a_scenes_id_changes_with_any_of_its_values(scene):
     assert scene_id(scene) == scene_id(replace(scene))
     assert scene_id(scene) != scene_id(replace(scene, time_limit_steps=3))
-    assert len(scene_id(scene)) == 8
+    assert scene_id(scene) != scene_id(replace(scene, pedestrian_size=0.7))
+    # As in the tables of outputs/reference/resolution.zip, which are older than pedestrian_size.
+    assert scene_id(load_scene("straight_road")) == "5abf759d"

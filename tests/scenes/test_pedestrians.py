@@ -18,7 +18,7 @@ from flowrep.scenes.pedestrians import (
     keeps_lanes_apart,
     world_from_parts,
 )
-from flowrep.scenes.scene import PedestrianGroup, Walk
+from flowrep.scenes.scene import PedestrianGroup, SceneError, Walk
 from flowrep.simulator.meshes import person_meshes
 
 # A walks 10 m along x at 1 m/s; B a corner of 4 m along y and 3 m along x at 2 m/s; C stands.
@@ -98,13 +98,13 @@ HIP_M, LEG_M = 0.82, 0.82
 
 
 def test_hips_are_to_the_left_and_right_of_where_one_looks():
-    _, left, right = world_from_parts(POSE)
+    _, left, right = world_from_parts(POSE, 1.0)
     np.testing.assert_allclose(left[:3, 3], [4.9, 2.0, HIP_M], atol=1e-12)
     np.testing.assert_allclose(right[:3, 3], [5.1, 2.0, HIP_M], atol=1e-12)
 
 
 def test_a_leg_swings_back_while_the_other_swings_forward_and_the_body_only_turns():
-    body, left, right = world_from_parts(POSE)
+    body, left, right = world_from_parts(POSE, 1.0)
     np.testing.assert_allclose(body @ [1.0, 0.0, 1.2, 1.0], [5.0, 3.0, 1.2, 1.0], atol=1e-12)
     foot = np.array([0.0, 0.0, -LEG_M, 1.0])
     # sin 30° = 0.5: the foot is 0.41 m behind or before the hip and at 0.82·(1 - cos 30°) m.
@@ -113,19 +113,21 @@ def test_a_leg_swings_back_while_the_other_swings_forward_and_the_body_only_turn
     np.testing.assert_allclose((right @ foot)[:3], [5.1, 2.0 + 0.41, height], atol=1e-12)
 
 
-@pytest.mark.parametrize("swing", [0.0, 0.38, -0.38])
-def test_nobody_sinks_into_the_ground_or_outgrows_the_cylinder(swing):
+@pytest.mark.parametrize(("swing", "size"), [(0.0, 1.0), (0.38, 1.0), (-0.38, 0.7)])
+def test_nobody_sinks_into_the_ground_or_outgrows_the_cylinder(swing, size):
     poses = np.array([[0.0, 0.0, 0.0, swing]])
     points = np.concatenate(
         [
             mesh.triangles[0].reshape(-1, 3) @ transform[:3, :3].T + transform[:3, 3]
-            for mesh, transform in zip(person_meshes(0), world_from_parts(poses), strict=True)
+            for mesh, transform in zip(
+                person_meshes(0, size), world_from_parts(poses, size), strict=True
+            )
         ]
     )
     assert len(PARTS) == 3
     assert points[:, 2].min() > -0.05
-    assert points[:, 2].max() == pytest.approx(1.75)
-    assert np.abs(points[:, 1]).max() < 0.35
+    assert points[:, 2].max() == pytest.approx(1.75 * size)
+    assert np.abs(points[:, 1]).max() < 0.35 * size
 
 
 CROSSROADS = Path(__file__).parent / "crossroads.yaml"
@@ -142,15 +144,16 @@ def test_a_stretch_is_lost_where_a_line_is_moved_further_inwards_than_it_is_long
 def test_lanes_are_refused_where_a_walk_comes_back_beside_itself():
     hairpin = np.array([(0.0, 0.0), (10.0, 0.0), (10.0, 2.0), (0.0, 2.0)])
     # The two ways are 2 m apart: room for 0.3 m beside the outermost of lanes 1.3 m wide together.
-    assert keeps_lanes_apart(hairpin, 1.3)
-    assert not keeps_lanes_apart(hairpin, 1.5)
+    assert keeps_lanes_apart(hairpin, 1.3, 1.0)
+    assert not keeps_lanes_apart(hairpin, 1.5, 1.0)
+    assert keeps_lanes_apart(hairpin, 1.5, 0.7)
     crossing = np.array([(0.0, 0.0), (10.0, 0.0), (10.0, 6.0), (5.0, 6.0), (5.0, -6.0)])
-    assert not keeps_lanes_apart(crossing, 0.7)
+    assert not keeps_lanes_apart(crossing, 0.7, 1.0)
 
 
 def test_lanes_are_drawn_evenly_from_all_that_are_wide_enough():
     rng = np.random.default_rng(0)
-    draws = np.array([draw_lanes(2, 1.61, rng) for _ in range(4000)])
+    draws = np.array([draw_lanes(2, 1.61, 1.0, rng) for _ in range(4000)])
     gaps = np.abs(draws[:, 0] - draws[:, 1])
     assert gaps.min() >= 0.61 - 1e-12
     assert np.abs(draws).max() <= 1.61 / 2
@@ -158,7 +161,9 @@ def test_lanes_are_drawn_evenly_from_all_that_are_wide_enough():
     assert (gaps > 1.11).mean() == pytest.approx(0.25, abs=0.03)
     assert (draws[:, 0] > draws[:, 1]).mean() == pytest.approx(0.5, abs=0.03)
     assert draws.mean(axis=0) == pytest.approx(0.0, abs=0.03)
-    np.testing.assert_allclose(np.sort(draw_lanes(3, 1.22, rng)), [-0.61, 0.0, 0.61], atol=1e-9)
+    np.testing.assert_allclose(
+        np.sort(draw_lanes(3, 1.22, 1.0, rng)), [-0.61, 0.0, 0.61], atol=1e-9
+    )
 
 
 def least_distance(scene, speed_mps, episodes):
@@ -178,6 +183,13 @@ def least_distance(scene, speed_mps, episodes):
 @pytest.mark.parametrize("name", [*scene_names(), CROSSROADS])
 def test_people_never_overlap(name, speed_mps):
     assert least_distance(load_scene(name), speed_mps, episodes=15) >= 0.6
+
+
+def test_people_of_another_size_keep_apart_by_it():
+    large = replace(load_scene("s_turn"), pedestrian_size=1.5)
+    assert least_distance(load_scene(large), (1.2, 1.8), episodes=15) >= 0.9
+    with pytest.raises(SceneError, match="spread_m"):
+        load_scene(replace(large, pedestrian_size=3.0))
 
 
 @pytest.mark.parametrize("draw", ["group", "pedestrian"])
