@@ -217,7 +217,8 @@ def main() -> None:
     rights, mistakes, kinds, seconds = Counter(), Counter(), Counter(), []
     for seed, name, shots, kind, found, px, spent in cells(range(*args.seeds), args.what):
         seconds.append(spent)
-        route, share = shots.kind[2], "< 50 % moving" if shots.moving < 0.5 else ">= 50 %"
+        route, share = shots.kind[2], "> 75 %" if shots.moving > 0.75 else "50 to 75 %"
+        share = "< 50 % moving" if shots.moving < 0.5 else share
         if name:
             mistakes["listed" if name in {**LISTED, **TWO} else "unlisted", kind] += 1
             kinds[f"{name:32}", kind] += 1

@@ -118,7 +118,7 @@ class _Case:
         self.error_px = self.poses_px = math.nan
         if self.recorded.poses is not None:
             self.poses_px = max(self.recorded.deviation_px, *self.recorded.poses.noise_px)
-            error_px = math.hypot(*self.recorded.systematic_px, self.bias_px)
+            error_px = math.hypot(sum(self.recorded.systematic_px), self.bias_px)
             self.error_px = max([error_px, *self._hidden_px()])
 
     def _hidden_px(self) -> list[float]:
