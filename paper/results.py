@@ -722,6 +722,7 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
             wide=protocols_table(primary, in_its_scenes("wide_speeds"), "straight_road"),
             figure=FIGURE,
             length_figure=LENGTH_FIGURE,
+            length_decides=bool(long),
             length=length_table(at_that_length) if at_that_length else "",
             length_contrasts=length_contrasts([*primary, *secondary], long),
             length_held_out={

@@ -50,7 +50,9 @@ class Poses(NamedTuple):
         """
         known = self.nats.isfinite()
         used = known & ~self.is_bad if (known & ~self.is_bad).any() else known
-        of_motions, of_poses = (self._shared(used, chain) for chain in (0 * follows, follows))
+        of_motions, of_poses = (
+            self._shared(used, chain) for chain in (torch.zeros_like(follows), follows)
+        )
         c, cov, _ = of_poses if of_poses[2] > of_motions[2] + _DECIDES else of_motions
         root = self.by.root[used]
         square = (root @ cov @ root.mT).diagonal(dim1=-2, dim2=-1).sum(-1)
@@ -60,7 +62,7 @@ class Poses(NamedTuple):
         """Returns the motion `[6]` that errors have in common, its covariance, and the evidence."""
         pair, root = torch.arange(len(self.y)), self.by.root
         # The noise of each pose is a latent motion, as is the common one, which comes last.
-        last = pair + functional.pad((~follows.bool()).cumsum(0), (1, 0))
+        last = pair + functional.pad((~follows).cumsum(0), (1, 0))
         at = torch.zeros(len(pair), int(last[-1]) + 3).double()
         at[pair, last], at[pair, last + 1], at[:, -1] = -1.0, 1.0, 1.0
         H = torch.einsum("pl,pij->pilj", at, root).flatten(2)
