@@ -54,9 +54,9 @@ class Explanation:
         """The score, nats."""
         return float(self.of_pairs.sum()) - self.handicap
 
-    def sure_nats(self, recorded: Explanation) -> float:
-        """Returns by how much pairs agree that it is better than the data as recorded."""
-        return agreed(self.of_pairs - recorded.of_pairs) - self.handicap
+    def sure_nats(self, other: Explanation) -> float:
+        """Returns by how much pairs agree that it is better than another one."""
+        return agreed(self.of_pairs - other.of_pairs) - self.handicap + other.handicap
 
     @property
     def deviation_px(self) -> float:
