@@ -18,6 +18,7 @@ pytest.importorskip("cv2", reason="recordings need OpenCV")
 
 from benchmarks.diagnosis import examined, found_of, outcome, tensordict_of
 from benchmarks.mistakes import FLU, LISTED, OPENGL, UNLISTED
+from benchmarks.mistakes import drawn as mistaken
 from benchmarks.shots import draw, frames_of
 from flowrep import diagnose, diagnosis, geometry, transforms
 from flowrep.diagnosis import Examination
@@ -107,6 +108,13 @@ def test_a_listed_mistake_is_named(name, seed):
 )
 def test_a_mistake_that_nobody_listed_is_noticed(name):
     assert found_of(with_mistake(name)).is_wrong
+
+
+def test_a_mistake_and_another_that_fits_as_well_are_told_together():
+    kind, found, _ = outcome(drawn(73047), *mistaken(drawn(73047), 73047))
+    assert kind == "named"
+    assert any(name.startswith("marker_from_cam") for name in found.suspects)
+    assert len(found.suspects) <= 3
 
 
 def test_every_mistake_changes_the_data():
