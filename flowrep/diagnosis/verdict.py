@@ -20,7 +20,7 @@ _HARMLESS_PX = 0.05
 _HARMLESS = 0.05  # of the flow's length
 _REST_PX = 0.25  # flow of a camera at rest: there is none but poses' noise to be wrong
 _TOLD = 3  # explanations at most, the likeliest
-_ALIKE = 3.0  # nats: explanations that are as near to the likeliest are told beside it
+_ALIKE = 3.0  # nats: explanations that aren't worse than another by more fit alike
 _ALIKE_SHARE = 0.7  # of a vague one's nats: a mistake with a name explains as much
 _NOISE = 3.0  # times the noise: differences below it may be noise
 _MANY = 0.2  # of all pairs: if poses of so many don't fit, they are wrong
@@ -255,8 +255,12 @@ def _likeliest(
         return []
     if first.rival.is_vague:
         return [first]
-    # Those that pairs don't agree to be worse than the first.
-    alike = [e for e in named if first.sure_nats(e) <= _ALIKE and min(sure[e], effects[e]) > 0]
+    # Those that pairs don't agree to be worse than the first, and that matter as much.
+    alike = [
+        each
+        for each in named
+        if first.sure_nats(each) <= _ALIKE and sure[each] > 0 and effects[each] > least_px
+    ]
     alike = sorted(alike, key=lambda each: -each.nats)
     # Of those with one subject, the ones with more numbers than needed say nothing more.
     fewest = {e.rival.subject: len(e.n) for e in sorted(alike, key=lambda e: -len(e.n))}
