@@ -114,7 +114,7 @@ def test_a_leg_swings_back_while_the_other_swings_forward_and_the_body_only_turn
 
 
 @pytest.mark.parametrize(("swing", "size"), [(0.0, 1.0), (0.38, 1.0), (-0.38, 0.7)])
-def test_nobody_sinks_into_the_ground_or_outgrows_the_cylinder(swing, size):
+def test_people_stand_on_the_ground_and_fill_no_more_than_the_cylinder(swing, size):
     poses = np.array([[0.0, 0.0, 0.0, swing]])
     points = np.concatenate(
         [
@@ -125,7 +125,7 @@ def test_nobody_sinks_into_the_ground_or_outgrows_the_cylinder(swing, size):
         ]
     )
     assert len(PARTS) == 3
-    assert points[:, 2].min() > -0.05
+    assert -0.05 < points[:, 2].min() < 0.1
     assert points[:, 2].max() == pytest.approx(1.75 * size)
     assert np.abs(points[:, 1]).max() < 0.35 * size
 
