@@ -89,12 +89,18 @@ def test_flow_that_mostly_follows_no_motion_is_not_called_right():
     assert (found.verdict, "follow no motion" in found.words) == ("can't tell", True)
 
 
+def test_most_poses_that_do_not_fit_estimated_flow_are_not_called_right():
+    kind, found, _ = outcome(drawn(74166), *mistaken(drawn(74166), 74166))
+    assert (kind, "or flow was estimated wrongly" in found.words) == ("can't tell", True)
+
+
 @pytest.mark.parametrize(
     ("name", "seed"),
     [
         ("poses world-to-camera", ROOM), ("poses OpenGL", NOISY), ("poses a frame late", ROOM),
         ("depth in mm", NOISY), ("flow backward", ROOM), ("K of another size", ROOM),
         ("poses NED", STREET_ENV), ("depth in mm", STREET_ENV),
+        ("depth upside down", 70156),  # where it was turned back, a third of it is unknown
     ],
 )  # fmt: skip
 def test_a_listed_mistake_is_named(name, seed):
@@ -198,6 +204,7 @@ def test_what_hardly_moves_or_is_hardly_known_tells_nothing():
                                  depth=right.depth[[0] * 10]))  # fmt: skip
     assert still.is_right  # there is no flow that could be wrong
     assert "9 of 9 pairs tell little: hardly anything moves" in still.notes
+    assert any("K and depth are not tested" in note for note in still.notes)
     unknown = right.depth.copy()
     unknown[:, 1:] = np.nan
     unknown[:, 0, 40:] = np.nan

@@ -12,6 +12,7 @@ from flowrep.diagnosis.fit import Pairs, gauss_newton, residuals
 from flowrep.diagnosis.rivals import Rival
 
 # A fitted factor beyond these, or below their inverse, is no camera's and no unit's.
+_LOST = 1e3  # nats a pixel, of a pair in which a correction leaves nothing known
 _LARGEST_FACTORS = {"camera": 30.0, "depth": 1e5}
 
 
@@ -50,7 +51,8 @@ def candidate(pairs: Pairs, rival: Rival, motion: Tensor, noise: Tensor) -> Cand
 
     def cost(n: Tensor) -> float:
         squared = (residuals_of(n.unsqueeze(0)) / noise.unsqueeze(1)).square().sum(2)
-        return float(squared.nan_to_num(1e6).log1p().mean())
+        # Depth that is looked up elsewhere is unknown at some pixels: they count as others do.
+        return float(squared.log1p().nanmean(-1).nan_to_num(_LOST).mean())
 
     starts = [noise.new_tensor(start).expand(count, k) for start in rival.start]
     if not k:

@@ -105,6 +105,7 @@ class Explanation:
             raw = torch.linalg.solve(gain, self.pairs.raw)
             apart.append((raw - other) - (recorded.pairs.raw - ego))
         known = recorded.pairs.raw.isfinite().all(1) & ~recorded.pairs.depth.isnan()
+        known &= ~self.pairs.depth.isnan()
         known &= self.motion.isfinite().flatten(1).all(1, keepdim=True)  # at ends of a recording
         sizes = [length(x).nan_to_num(1e4, 1e4)[known] for x in apart]
         return max(float(x.median()) if len(x) else 0.0 for x in sizes)

@@ -110,6 +110,9 @@ def mixture(pairs: Pairs, motions: Tensor, noise: Noise) -> Mixture:
     rest, known = residuals(pairs, motions), ~pairs.depth.isnan()
     density = _density(rest, noise) / _outlier_density(pairs)
     number, M = known.sum(-1), len(motions)
+    # Pixels that a correction leaves unknown count as the others do on average.
+    total_number = pairs.raw.isfinite().all(1).sum(-1)
+    weight = total_number / number.maximum(total_number / 2).clamp(min=1) / noise.together
     if not pairs.by_flow:  # one of these, since edges pull others about
         seen = rest.isfinite().all(-2)
         shares = torch.full((M, len(number)), 0.8).double()
@@ -130,7 +133,7 @@ def mixture(pairs: Pairs, motions: Tensor, noise: Noise) -> Mixture:
             total = each.sum(0) + (1 - shares.sum(0)).unsqueeze(-1)
             odds = each / total * known
             shares = ((odds.sum(-1) + 0.5) / (number + 1 + M)).clamp(max=0.99) * kept
-        return shares, odds, (total.log() * known).sum(-1) / noise.together
+        return shares, odds, (total.log() * known).sum(-1) * weight
 
     cost = 7 * (number / noise.together).clamp(min=2).log() / 2
     kept = torch.zeros(M, len(number), dtype=torch.bool)

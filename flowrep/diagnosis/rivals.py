@@ -334,7 +334,7 @@ def _turned(axis: int, pairs: Pairs, n: Tensor) -> Pairs:
         return pairs._replace(K=turn @ pairs.K, prev_K=turn @ pairs.prev_K)
     pixel = pairs.pixel.clone()
     pixel[:, axis] = pairs.now.shape[2 - axis] - pixel[:, axis]
-    return pairs._replace(depth=looked_up(pairs.now, pixel).reciprocal())
+    return pairs._replace(depth=looked_up(pairs.now, pixel, "nearest").reciprocal())
 
 
 def _gain(uu: float, uv: float, vu: float, vv: float) -> Change:

@@ -186,8 +186,11 @@ class _Case:
         is_bad = poses.is_bad & is_world & (off_px > _NOISE * poses.sigma_px)
         is_bad &= off_px > max(_NOISE * deviation_px, self.rough_px)
         bad = [name for name, is_one in zip(names, is_bad.tolist()) if is_one]
-        if len(bad) >= max(3, _MANY * len(names)) and not self.pairs.is_estimated:
+        many = 0.5 if self.pairs.is_estimated else _MANY
+        if len(bad) >= max(3, many * len(names)):
             why = f"poses of {len(bad)} in {len(names)} pairs don't fit: {', '.join(bad)}"
+            if self.pairs.is_estimated:
+                return self._diagnosis("can't tell", f"{why}, or flow was estimated wrongly")
             if self.recorded.is_beside_bodies:
                 return self._diagnosis("can't tell", f"{why}, or a body fills the picture")
             return self._diagnosis("something is wrong", why)
@@ -224,6 +227,8 @@ class _Case:
         if self.recorded.poses is None:
             self.notes.append("poses, K and the unit of depth are not tested")
             return self._diagnosis("right", f"one motion explains raw flow and depth {noise}")
+        if self.found.flow_px < _REST_PX:
+            self.notes.append("the camera hardly moves: K and depth are not tested")
         parts = "raw flow, " * self.pairs.by_flow + "depth, K, the camera's motion"
         words = f"{parts} agree to within {self.error_px:.2g} px {noise}"
         words += f" and poses' {self.poses_px:.2g} px"
