@@ -6,8 +6,6 @@ Commands check names before they import PyTorch, so here only what loads a polic
 from __future__ import annotations
 
 import sys
-import sysconfig
-import traceback
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
@@ -260,7 +258,7 @@ def _whole_options(name: str) -> dict[str, Any]:
 
 
 class PolicyError(Exception):
-    """A policy from another project is missing, fails or returns no actions."""
+    """A policy from another project is no function, or returns no actions."""
 
 
 @dataclass(frozen=True)
@@ -316,10 +314,13 @@ class ForeignPolicy(NamedPolicy):
     def built_for(self, task: Task) -> ForeignFunction:
         """Returns the policy for a task."""
         with _naming_policy(self.name):
-            act = getattr(_module(self.module), self.function)(task)
-            if not callable(act):
-                what = f"{self.function}(task) returned a {type(act).__name__}"
-                raise PolicyError(f"{what}; expected a function of a TensorDict of maps")
+            module = _module(self.module)
+            if not hasattr(module, self.function):
+                raise UsageError(f"policy={self.name}: {self.module} has no {self.function}")
+            act = getattr(module, self.function)(task)
+        if not callable(act):
+            what = f"{self.function}(task) returned a {type(act).__name__}"
+            raise PolicyError(f"policy '{self.name}': {what}, not a function of a TensorDict")
         return ForeignFunction(self.name, act, task)
 
 
@@ -349,34 +350,20 @@ class ForeignFunction:
         n = int(self._task.action_spec.space.n)
         try:
             actions = torch.as_tensor(given).cpu()
-            whole = actions.long()
-            if actions.shape != maps.batch_size:
-                what = f"{actions.dtype} of shape {tuple(actions.shape)}"
-            elif ((whole == actions) & (whole >= 0) & (whole < n)).all():
-                return maps.set("action", whole)
-            else:
-                what = str(actions.tolist())
-        except (TypeError, ValueError, RuntimeError):
-            what = f"a {type(given).__name__}"
-        raise PolicyError(
-            f"policy '{self.name}' returned {what}; expected {len(maps)} whole numbers from 0 to "
-            f"{n - 1}, one action per environment"
-        )
-
-
-_FOLDERS: set[Path] = set()  # of the scripts that were loaded
+        except (TypeError, ValueError, RuntimeError):  # None, for instance
+            actions = torch.empty(0)
+        if actions.shape != maps.batch_size or not torch.isin(actions, torch.arange(n)).all():
+            raise PolicyError(
+                f"policy '{self.name}' returned {given!s:.200}; expected {len(maps)} whole numbers "
+                f"from 0 to {n - 1}, one action per environment"
+            )
+        return maps.set("action", actions.long())
 
 
 def _module(name: str) -> Any:
     if not name.endswith(".py"):
         return import_module(name)
     path = Path(name).resolve()
-    # Under a name that an earlier script imported, Python would give this one the same module.
-    for loaded, module in list(sys.modules.items()):
-        file = Path(getattr(module, "__file__", None) or "/")
-        if {file.parent, file.parent.parent} & (_FOLDERS - {path.parent}):
-            del sys.modules[loaded]
-    _FOLDERS.add(path.parent)
     sys.path.insert(0, str(path.parent))  # as Python does for a script
     spec = spec_from_file_location(f"flowrep_policy_{path.stem}", path)
     assert spec is not None
@@ -387,26 +374,12 @@ def _module(name: str) -> Any:
     return module
 
 
-# Prefixes of the names of files that the author of a policy didn't write.
-_LIBRARIES = (
-    sysconfig.get_path("stdlib"), sysconfig.get_path("purelib"), str(Path(__file__).parents[1]),
-    "<frozen ",
-)  # fmt: skip
-
-
 @contextmanager
 def _naming_policy(name: str) -> Iterator[None]:
-    """Turns an exception in a policy's code into a PolicyError: one line, with file and line."""
+    """Names the policy above the traceback of an exception in its code, which its author needs."""
     try:
         yield
-    except PolicyError as error:
-        raise PolicyError(f"policy '{name}': {error}") from error.__cause__
+    except (UsageError, ImportError):  # a line says all
+        raise
     except Exception as error:
-        text = str(error).strip().splitlines()
-        # The last line that the author wrote, rather than one deep in a library.
-        frames = traceback.extract_tb(error.__traceback__)
-        theirs = [frame for frame in frames if not frame.filename.startswith(_LIBRARIES)]
-        where = f" ({theirs[-1].filename}, line {theirs[-1].lineno})" if theirs else ""
-        raise PolicyError(
-            f"policy '{name}' failed: {type(error).__name__}: {text[0] if text else ''}{where}"
-        ) from error
+        raise RuntimeError(f"policy '{name}' failed") from error

