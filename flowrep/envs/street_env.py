@@ -231,8 +231,6 @@ class StreetEnv(gym.Env):
         ValueError: another argument is invalid.
     """
 
-    sensing: Sensing
-    _street: Street
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 12}  # noqa: RUF012
 
     def __init__(
@@ -256,9 +254,9 @@ class StreetEnv(gym.Env):
         self.metadata = {**self.metadata, "render_fps": self.frame_rate_hz}
         self.num_classes = num_classes(self.scene.categories)
         ticks_for(self.scene, self.frame_rate_hz, self.speed_mps, 0.0)
-        self._camera = sensors, picture_scale
         self._episode: Episode | None = None
-        self._open()
+        self._street = Street.shared(self.scene)
+        self.sensing = Sensing.shared(self._street, sensors, picture_scale)
         self.K = self.sensing.K
         self.action_space = spaces.Discrete(len(YAW_SIGN))
         self.observation_space = self.sensing.space()
@@ -291,8 +289,6 @@ class StreetEnv(gym.Env):
     def begin(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
         """Begins an episode like `reset`, without an observation."""
         super().reset(seed=seed)
-        if self._street is None:  # closed
-            self._open()
         options = options or {}
         if "state" in options:
             if others := sorted(options.keys() - {"state"}):
@@ -309,7 +305,7 @@ class StreetEnv(gym.Env):
 
     def drive(self, action: int) -> Outcome:
         """Drives one step like `step`, without an observation."""
-        episode = self._opened()
+        episode = self.episode
         if action not in range(len(YAW_SIGN)):
             raise ValueError(
                 f"action is {action!r}; give 0 (keep the yaw rate), 1 (turn left) or 2 (turn right)"
@@ -321,24 +317,7 @@ class StreetEnv(gym.Env):
 
     def render(self) -> Any:
         """Returns the camera's picture, [H, W, 3] uint8, if the render mode is "rgb_array"."""
-        episode = self._opened()
-        return None if self.render_mode is None else self.sensing.rgb(episode)
-
-    def close(self) -> None:
-        """Releases the street, whose simulator closes with the last env that uses it.
-
-        `reset` opens it again; until then only the state of the episode remains.
-        """
-        self.sensing = self._street = None  # type: ignore[assignment]
-
-    def _opened(self) -> Episode:
-        if self._street is None:
-            raise RuntimeError("the env is closed: call reset() first")
-        return self.episode
-
-    def _open(self) -> None:
-        self._street = Street.shared(self.scene)
-        self.sensing = Sensing.shared(self._street, *self._camera)
+        return None if self.render_mode is None else self.sensing.rgb(self.episode)
 
     def get_state(self) -> dict[str, Any]:
         """Returns the complete state as JSON-serialisable data."""

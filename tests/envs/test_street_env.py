@@ -311,16 +311,6 @@ def test_invalid_reset_options_are_refused(make_street, empty_road):
     assert env.reset(options={"episode_seed": np.int64(last)})[1]["episode_seed"] == last
 
 
-def test_a_closed_street_opens_again_with_a_reset(make_street, empty_road):
-    env = make_street(empty_road, sensors=("depth",), render_mode="rgb_array")
-    before, _ = env.reset(seed=1)
-    env.close()
-    with pytest.raises(RuntimeError, match="call reset"):
-        env.render()
-    assert same(before, env.reset(seed=1)[0])
-    assert env.render().shape == (84, 84, 3)
-
-
 def test_motion_between_two_steps_is_the_one_driven(make_street, empty_road):
     env = make_street(empty_road, sensors=("prev_from_curr", "instance_motion"))
     env.reset(seed=0)
