@@ -101,18 +101,10 @@ def one_stands(straight_road):
 
 @pytest.fixture
 def make_street():
-    """Makes streets that are closed when the test ends."""
+    """Makes streets; not imported before, as few tests need PyBullet."""
     from flowrep.envs import StreetEnv
 
-    made = []
-
-    def make(*args, **kwargs):
-        made.append(StreetEnv(*args, **kwargs))
-        return made[-1]
-
-    yield make
-    for street in made:
-        street.close()
+    return StreetEnv
 
 
 @pytest.fixture

@@ -22,7 +22,6 @@ from flowrep.scenes.scene import (
     CATEGORY_ID,
     Range,
     Scene,
-    check_speed,
     num_classes,
 )
 from flowrep.scenes.vehicle import YAW_SIGN, VehicleState, footprint_corners, roll, turn
@@ -80,8 +79,6 @@ def ticks_for(scene: Scene, frame_rate_hz: float, speed_mps: Range, driven_mps: 
     """Returns how many times a step tests the footprint, at the speeds of an episode."""
     groups = [group for group in scene.pedestrian_groups if group.standing < group.count]
     fastest_mps = max(((group.speed_mps or speed_mps)[1] for group in groups), default=0.0)
-    check_speed("speed", fastest_mps, scene.camera, frame_rate_hz)
-    check_speed("vehicle_speed_mps", driven_mps, scene.camera, frame_rate_hz)
     driven_hz = driven_mps * max(_CHECKS_PER_M, 1.0 / scene.vehicle.length_m)
     checks_hz = max(_CHECKS_HZ, driven_hz, fastest_mps * _CHECKS_PER_M)
     return math.ceil(checks_hz / frame_rate_hz - 1e-9)
@@ -253,7 +250,6 @@ class StreetEnv(gym.Env):
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self.frame_rate_hz}
         self.num_classes = num_classes(self.scene.categories)
-        ticks_for(self.scene, self.frame_rate_hz, self.speed_mps, 0.0)
         self._episode: Episode | None = None
         self._street = Street.shared(self.scene)
         self.sensing = Sensing.shared(self._street, sensors, picture_scale)

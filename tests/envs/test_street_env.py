@@ -245,7 +245,6 @@ def test_reset_options_set_speed_and_frame_rate_of_one_episode(make_street):
         ({"speed": (2.0, 1.0)}, r"speed is \(2.0, 1.0\)"),
         ({"speed": (1.0,)}, r"speed is \(1.0,\)"),
         ({"speed": None}, "speed is None"),
-        ({"speed": (1.0, 1e8)}, r"speed: is 1e\+08 m/s"),
         ({"speed": ("1", "2")}, r"speed is \('1', '2'\)"),
         ({"frame_rate_hz": 0}, r"frame_rate_hz is 0;"),
         ({"frame_rate_hz": "12"}, r"frame_rate_hz is '12'"),
@@ -296,8 +295,6 @@ def test_invalid_reset_options_are_refused(make_street, empty_road):
         ("speed", (1.0, math.nan), r"speed is \(1.0, nan\)"),
         ("state", 5, "get_state"),
         ("state", {"steps": 3}, "get_state: .*episode_seed"),
-        # A step of a twelfth of a second would lead past all that is seen, 300 m.
-        ("vehicle_speed_mps", 1e7, r"vehicle_speed_mps: is 1e\+07 m/s.* 3600 m/s"),
     ):
         with pytest.raises(ValueError, match=message):
             env.reset(options={option: value})
