@@ -27,7 +27,6 @@ if __name__ == "__main__":
 from benchmarks.mistakes import LISTED, TWO, drawn
 from benchmarks.shots import Array, Shots, draw, flow_of, frames_of
 
-
 # Words by which a diagnosis says that mistakes with these names may be hidden.
 ADMITTED = {
     "bodies": "bodies are not tested",

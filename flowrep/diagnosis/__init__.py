@@ -7,6 +7,7 @@ data as recorded compete with the same data after each usual mistake is undone, 
 `recordings` and `envs` make pairs of frames (`fit`). `rivals` lists the mistakes, `candidates` fits
 their numbers, `pictures` says what pairs show, `poses` how well recorded motions fit that,
 `explanation` scores both, `competition` has all explanations, and `verdict` says what follows.
+`limits` has what they decide by.
 """
 
 from flowrep.diagnosis.envs import diagnose

@@ -8,11 +8,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from flowrep.diagnosis.fit import Pairs, gauss_newton, residuals
+from flowrep.diagnosis.fit import BEHIND_PX, Pairs, gauss_newton, residuals
 from flowrep.diagnosis.rivals import Rival
 
 # A fitted factor beyond these, or below their inverse, is no camera's and no unit's.
-_LOST = 1e3  # nats a pixel, of a pair in which a correction leaves nothing known
 _LARGEST_FACTORS = {"camera": 30.0, "depth": 1e5}
 
 
@@ -52,7 +51,7 @@ def candidate(pairs: Pairs, rival: Rival, motion: Tensor, noise: Tensor) -> Cand
     def cost(n: Tensor) -> float:
         squared = (residuals_of(n.unsqueeze(0)) / noise.unsqueeze(1)).square().sum(2)
         # Depth that is looked up elsewhere is unknown at some pixels: they count as others do.
-        return float(squared.log1p().nanmean(-1).nan_to_num(_LOST).mean())
+        return float(squared.log1p().nanmean(-1).nan_to_num(BEHIND_PX).mean())
 
     starts = [noise.new_tensor(start).expand(count, k) for start in rival.start]
     if not k:

@@ -13,6 +13,7 @@ from flowrep.diagnosis import explanation, fit, pictures, poses
 from flowrep.diagnosis.candidates import Candidate, candidate
 from flowrep.diagnosis.explanation import Explanation
 from flowrep.diagnosis.fit import EYE, Pairs, flow_of, length, median, residuals
+from flowrep.diagnosis.limits import SURE
 from flowrep.diagnosis.pictures import Metric, Mixture, Noise
 from flowrep.diagnosis.rivals import Rival
 from flowrep.geometry.egomotion import motion_of_points
@@ -83,7 +84,7 @@ class Competition:
     def is_seen(self, other: Explanation) -> bool:
         """Whether data show what it needs: raw flow beyond noise, or else a camera that moves."""
         null = self.of_noise if other.rival.subject == "flow" else self.still
-        return null is None or other.nats - null.nats > explanation.SURE
+        return null is None or other.nats - null.nats > SURE
 
     def _explained(self, by: Candidate, motions: Tensor) -> Explanation:
         """Returns a candidate that changes what pictures show, given motions `[M, P, 4, 4]`."""

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from flowrep import geometry
-from flowrep.diagnosis import explanation, pictures, poses
+from flowrep.diagnosis import explanation, fit, limits, pictures, poses, recordings
 from flowrep.diagnosis.competition import Competition
 from flowrep.diagnosis.fit import (
     EYE,
@@ -22,29 +22,11 @@ from flowrep.diagnosis.fit import (
     median,
     middle,
     residuals,
-    sampled,
     seen_before,
-)
-from flowrep.diagnosis.recordings import (
-    no_diagnosis,
-    note_on_untested,
-    reasons_untestable,
-    tested,
 )
 from flowrep.diagnosis.rivals import rivals_of
 from flowrep.diagnosis.verdict import Diagnosis, judged
 
-_PAIRS = 12  # that are tested at most, to save time
-# A body counts in each frame that shows it.
-_BODIES = 24  # that are tested at most, to save time
-_MOVED_PX = 0.25  # least flow or residual of a body that is tested: with less, it is at rest
-_FEW_PIXELS = 32  # least pixels of a body that is tested
-_FEW_FRAMES = 3  # least frames of a body that is tested
-_WORLD_SHARE = 0.2  # of the picture: with more of id 0, it is the world if motions are unknown
-# Flow that is computed again differs by rounding: by these pixels, and by this share of its length.
-_SAME_PX = 0.02
-_SAME_SHARE = 0.01
-_NOISY = 0.25  # share of flow's length by which noise of sensors may change it
 _ADAPTERS = {
     "pose_layout": "AdaptPose", "pose_direction": "AdaptPose", "pose_axes": "AdaptPose",
     "depth_kind": "AdaptDepth", "near_m": "AdaptDepth", "far_m": "AdaptDepth",
@@ -91,8 +73,8 @@ def diagnose(
     K, prev_K = (_intrinsics(x, intrinsics) for x in (now, before))
     kept = _motion(now).isfinite().flatten(1).all(1).nonzero()[:, 0]
     if not len(kept):
-        return no_diagnosis(["no camera motion between two frames is known"])
-    kept = kept[_spread(len(kept), 2 * _PAIRS)]
+        return recordings.no_diagnosis(["no camera motion between two frames is known"])
+    kept = kept[_spread(len(kept), 2 * limits.PAIRS)]
     seen = _Seen(now[kept], before[kept], K[kept], prev_K[kept], raw_key)
     if bool((seen.depth < 0).double().mean() > 0.5):
         why = "depth is negative: give its opposite"
@@ -107,18 +89,18 @@ def diagnose(
         raw, picture = seen.raw, seen.now["sensor"].get("rgb", None)
     before = torch.where(seen.was_static[:, 0], seen.before, math.nan)
     maps = (static, before, seen.K, seen.prev_K, torch.stack(path, 1), picture)
-    pairs = sampled(raw, *maps)
-    reasons = reasons_untestable(pairs)
-    used = tested(reasons)
+    pairs = fit.sampled(raw, *maps)
+    reasons = recordings.reasons_untestable(pairs)
+    used = recordings.tested(reasons)
     if not used:
-        return no_diagnosis(reasons)
-    testable = torch.tensor(used)[_spread(len(used), _PAIRS)]
+        return recordings.no_diagnosis(reasons)
+    testable = torch.tensor(used)[_spread(len(used), limits.PAIRS)]
     rivals = rivals_of({}, by_flow=is_measured, of_flow=is_measured, absolute=is_absolute)
     names = [str(index) for index in kept[testable].tolist()]
     result = judged(Competition(pairs.select(testable), rivals), names, _adapter_call)
     faults, odd = _recomputed(seen, ego_key, obj_key)
     kind, of_bodies = ("", "") if result.is_wrong else _bodies(seen)
-    odd += note_on_untested(reasons)
+    odd += recordings.note_on_untested(reasons)
     odd += [of_bodies] * (kind == "untested")
     result = replace(result, notes=(*result.notes, *odd))
     if faults := [*faults, *[of_bodies] * (kind == "fault")]:
@@ -126,6 +108,11 @@ def diagnose(
         verdict = result.verdict if result.is_wrong else "wrong"
         return replace(result, verdict=verdict, words=words)
     return result
+
+
+def _rounded_px(size: Any) -> Any:
+    """Returns how far flow that is computed twice may differ, px, given its length."""
+    return 2 * (limits.ROUNDED[0] + limits.ROUNDED[1] * size)
 
 
 def _spread(count: int, most: int) -> Tensor:
@@ -198,7 +185,7 @@ class _Seen:
             stands.gather(1, ids.flatten(1)).view_as(ids) for ids in (rows, before)
         )
         is_world = (self.ids == 0) & self.depth.isfinite()
-        if not self.has_rows and is_world.double().mean() > _WORLD_SHARE:
+        if not self.has_rows and is_world.double().mean() > limits.MANY:
             self.is_static, self.was_static = self.ids == 0, self.ids_before == 0
         self.flow = geometry.rigid_flow(self.depth, rows, self.K, self.rows, prev_K=self.prev_K)
         self.ego = self.flow_of(self.motion)
@@ -208,7 +195,7 @@ class _Seen:
             self.raw = torch.where(valid, self.raw.double(), math.nan)
             expected = torch.where(self.flow.valid, self.flow.flow, math.nan)
             apart, size = (length(x.flatten(2)) for x in (self.raw - expected, expected))
-            differs = (apart > _SAME_PX + _SAME_SHARE * size)[apart.isfinite()]
+            differs = (apart > _rounded_px(size))[apart.isfinite()]
             self.is_derived = not differs.double().mean() > 0.5
 
     def flow_of(self, motion: Tensor) -> geometry.Flow:
@@ -239,11 +226,11 @@ def _recomputed(seen: _Seen, ego_key: str, obj_key: str) -> tuple[list[str], lis
         px, as_factor_px, size_px = (
             float(x.norm(dim=-1).median()) for x in (given - right, given - factor * right, right)
         )
-        if px <= _SAME_PX + _SAME_SHARE * size_px:
+        if px <= _rounded_px(size_px):
             continue
         if 1e-3 < factor < 1e3 and as_factor_px < px / 20:
             odd.append(f"{description}, but {factor:.3g} times that (a scale, or px/s)")
-        elif px < _NOISY * size_px:
+        elif px < limits.MOST_NOISE * size_px:
             odd.append(f"{description} ({px:.2g} px off), as if one had noise")
         else:
             faults.append(f"{description} ({px:.2g} px off)")
@@ -269,10 +256,10 @@ def _bodies(seen: _Seen) -> tuple[str, str]:
         return "untested", f"bodies {which} move, but no pixel of instance has their ids"
     known = torch.where(seen.depth[:, 0].isfinite() & (ids > 0), ids, 0)
     sizes = functional.one_hot(known.flatten(1), count).sum(1)
-    body, frame = (sizes.T[1:] >= _FEW_PIXELS).nonzero().T
+    body, frame = (sizes.T[1:] >= limits.FEW_PIXELS).nonzero().T
     if not len(body):
         return "untested", unseen
-    chosen = _spread(len(frame), _BODIES)
+    chosen = _spread(len(frame), 2 * limits.PAIRS)
     frame, body = frame[chosen], body[chosen] + 1
     of_body = body[:, None, None]
     depth = torch.where(known[frame] == of_body, seen.depth[frame, 0], math.nan)
@@ -284,14 +271,15 @@ def _bodies(seen: _Seen) -> tuple[str, str]:
     before = torch.where(is_body, before, other)
     first = EYE.expand(len(frame), 4, 4)
     path = torch.stack([first, first, seen.rows[frame, body], first], 1)
-    pairs = sampled(None, depth, before, seen.K[frame], seen.prev_K[frame], path)
+    pairs = fit.sampled(None, depth, before, seen.K[frame], seen.prev_K[frame], path)
     still = seen.motion[frame]
     at, at_rest = (seen_before(pairs, motion)[0] for motion in (pairs.motion, still))
     residuals_px = residuals(pairs, pairs.motion)
     moved_px, residual_px = middle(at - at_rest), middle(residuals_px)
     number = residuals_px.isfinite().sum((1, 2))
-    testable = (torch.maximum(moved_px, residual_px) >= _MOVED_PX) & (number >= _FEW_PIXELS)
-    if int(testable.sum()) < _FEW_FRAMES:
+    testable = torch.maximum(moved_px, residual_px) >= limits.REST_PX
+    testable &= number >= limits.FEW_PIXELS
+    if int(testable.sum()) < limits.FEW:
         return "untested", unseen
     bodies = [f"body {i}" for i in body[testable].tolist()]
     competition = Competition(pairs.select(testable), [])
@@ -305,7 +293,7 @@ def _bodies(seen: _Seen) -> tuple[str, str]:
     off_px = median(middle(best - flow_of(pairs, pairs.motion)))
     most_px = poses.most_noise_px(pairs, competition.flow_px)
     gain = explanation.agreed(shown.nats - exact.nats)
-    if gain > max(explanation.SURE, 5 * len(bodies)) and off_px > most_px:  # 5 nats for each
+    if gain > max(limits.SURE, 5 * len(bodies)) and off_px > most_px:  # 5 nats for each
         why = f"another motion, {off_px:.2g} px from theirs, fits their pixels better"
         return "fault", f"instance_motion or ids don't fit the bodies: {why}"
     if not found.is_right:

@@ -16,16 +16,12 @@ import torch
 from torch import Tensor
 
 from flowrep.diagnosis.fit import Pairs, flow_of, length, median
+from flowrep.diagnosis.limits import FEW, PAIR, SURE
 from flowrep.diagnosis.pictures import Metric, Mixture, best_of
 from flowrep.diagnosis.poses import Poses, on_average
 from flowrep.diagnosis.rivals import Rival
 
-# Nats that an explanation has to be better by: 15 are the odds of a hundred thousand to one for one
-# of fifty rivals; noise that pixels share doubles what chance gives.
-SURE = 25.0
-_MOST_NATS = 10.0  # that a pair counts for or against an explanation, of few pairs more
 _BODY = 0.03  # of the pixels: a motion of fewer may be chance
-_FEW_PAIRS = 3  # that show a body
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +75,7 @@ class Explanation:
         others = self.shown.odds.amax(0) - self.shown.odds[self.poses.mode, pair]
         share = torch.where(known, others, math.nan).nanmean(-1)
         is_beside = (share > _BODY) & ~self.poses.is_bad
-        return self.pairs.by_flow and int(is_beside.sum()) >= _FEW_PAIRS
+        return self.pairs.by_flow and int(is_beside.sum()) >= FEW
 
     @cached_property
     def systematic_px(self) -> tuple[float, float]:
@@ -117,6 +113,6 @@ def agreed(nats: Tensor) -> float:
     It is the sum less twice its standard deviation: errors that pixels share make the nats of a
     pair too large, but not those of all pairs alike.
     """
-    most = max(_MOST_NATS, 2 * SURE / len(nats))
+    most = max(PAIR, 2 * SURE / len(nats))
     nats = nats[~nats.isnan()].clamp(-most, most)
     return float(nats.sum() - 2 * math.sqrt(len(nats)) * nats.std(correction=0))

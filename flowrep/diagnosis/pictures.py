@@ -13,14 +13,11 @@ from torch import Tensor
 
 from flowrep.diagnosis import fit
 from flowrep.diagnosis.fit import EYE, Pairs, flow_of, length, median, residuals
+from flowrep.diagnosis.limits import FEW_PIXELS, HARMLESS, MANY, ROUNDED
 
 # Of residuals: Student's t, whose tails are those of measured flow and depth.
 _FREEDOM = 4.0
-# Residuals have at least this noise: data are rounded, and depth is interpolated between pixels,
-# which is exact on planes only; estimated flow is wrong by so much, smoothly, on any surface.
-_ROUNDED = 0.01, 0.005  # px, and share of flow's length
-_INTERPOLATED_PX = 0.03
-_ESTIMATED = 0.05, 0.05  # px, and share of flow's length
+_INTERPOLATED_PX = 0.03  # noise of depth between pixels at least: it is exact on planes only
 _PARTS = 6, 4  # columns and rows of a picture, in which residuals may have a common error
 
 
@@ -42,14 +39,14 @@ def learnt_noise(pairs: Pairs, rest: Tensor) -> Noise:
     size = torch.where(size.isfinite(), size, math.nan)
     q, of_normal = near_share(pairs), 0.668 if pairs.by_flow else 0.598
     flow_px = median(length(pairs.raw)) if pairs.by_flow else 0.0
-    px, share = _ESTIMATED if pairs.is_estimated else _ROUNDED
+    px, share = HARMLESS if pairs.is_estimated else ROUNDED
     floor = max(_INTERPOLATED_PX, pairs.focal_px * pairs.grain)
     floor = px + share * flow_px if pairs.by_flow else floor
     ends = depth[depth.isfinite()].quantile(torch.tensor([0.25, 0.5, 0.75]).double())
     part, noise = torch.bucketize(depth.nan_to_num(), ends), torch.full_like(depth, floor)
     for i in range(4):
         is_in = (part == i) & size.isfinite()
-        if is_in.sum() >= 24:
+        if is_in.sum() >= FEW_PIXELS:
             noise[part == i] = max(float(size[is_in].quantile(q)) / of_normal, floor)
     u = rest / noise.unsqueeze(1)
     u = torch.where(length(u).unsqueeze(1) < 3, u, 0.0)
@@ -62,7 +59,7 @@ def learnt_noise(pairs: Pairs, rest: Tensor) -> Noise:
 
 def near_share(pairs: Pairs) -> float:
     """Returns the share of the pixels whose residuals show the noise: others may be outliers."""
-    return 0.2 if pairs.by_flow else 0.45  # depth without movers, but with steps
+    return MANY if pairs.by_flow else 0.45  # depth without movers, but with steps
 
 
 def _parts(pairs: Pairs) -> tuple[Tensor, Tensor]:
@@ -209,6 +206,6 @@ def metric(pairs: Pairs, shown: Mixture, noise: Noise) -> Metric:
     most_px = 2 * (length_px * odds).sum(-1) / total + 1
     cov = torch.linalg.inv_ex(information + torch.eye(6) / most_px.square()[..., None, None])[0]
     if pairs.is_estimated:  # its errors are smooth: a motion shares them
-        bias_px = _ESTIMATED[0] + _ESTIMATED[1] * length_px.median(-1).values
+        bias_px = HARMLESS[0] + HARMLESS[1] * length_px.median(-1).values
         cov = cov + bias_px.square()[..., None, None] / 6 * torch.eye(6)
     return Metric(root, cov, information, most_px)

@@ -10,10 +10,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from flowrep.diagnosis.fit import EYE, Pairs, median, motion_vector
+from flowrep.diagnosis.limits import ALIKE, MOST_NOISE
 from flowrep.diagnosis.pictures import Metric, Mixture
 
 _RATES = (0.02, 0.3)  # shares of pairs whose poses are bad
-_DECIDES = 3.0  # nats, between two models of noise: twenty to one
 
 
 class Poses(NamedTuple):
@@ -53,7 +53,7 @@ class Poses(NamedTuple):
         of_motions, of_poses = (
             self._shared(used, chain) for chain in (torch.zeros_like(follows), follows)
         )
-        c, cov, _ = of_poses if of_poses[2] > of_motions[2] + _DECIDES else of_motions
+        c, cov, _ = of_poses if of_poses[2] > of_motions[2] + ALIKE else of_motions
         root = self.by.root[used]
         square = (root @ cov @ root.mT).diagonal(dim1=-2, dim2=-1).sum(-1)
         return median((root @ c).norm(dim=-1)), 2 * median(square.clamp(min=0).sqrt())
@@ -79,7 +79,7 @@ class Poses(NamedTuple):
 
 def most_noise_px(pairs: Pairs, flow_px: float) -> float:
     """Returns the noise of poses beyond which they are no noisy ones."""
-    return max(0.25 * flow_px, 0.005 * pairs.focal_px)  # a quarter of the flow, 0.005 rad
+    return max(MOST_NOISE * flow_px, 0.005 * pairs.focal_px)  # 0.005 rad
 
 
 def compared(
@@ -117,7 +117,7 @@ def compared(
         nats = torch.logaddexp(math.log(1 - rate) + each, math.log(rate) + wide)
         total = torch.where(is_known, nats, 0.0).sum(-1)
         i = int(total.argmax())
-        if best is None or float(total[i]) > best[0] + 3:
+        if best is None or float(total[i]) > best[0] + ALIKE:
             best = float(total[i]), nats[i], i, math.log(rate) + wide > math.log(1 - rate) + each[i]
     _, nats, i, is_bad = best
     pair, at = torch.arange(len(motion)), mode[i]

@@ -13,14 +13,10 @@ from torch import Tensor
 from flowrep.diagnosis import fit
 from flowrep.diagnosis.competition import Competition
 from flowrep.diagnosis.fit import EYE, Pairs, sampled
+from flowrep.diagnosis.limits import FEW, FEW_PIXELS, MANY, REST_PX
 from flowrep.diagnosis.rivals import rivals_of
 from flowrep.diagnosis.verdict import Diagnosis, judged
 
-# Pairs with fewer known pixels tell nothing.
-_LEAST_PIXELS = 64
-_LEAST_MOVEMENT_PX = 0.25  # median length of flow; pairs with less are tested if few have more
-_FEWEST = 4  # pairs that move
-_MANY_UNTESTED = 0.2  # of all pairs: a note then gives their number
 _STILL = "hardly anything moves"
 
 
@@ -107,12 +103,12 @@ def reasons_untestable(pairs: Pairs) -> list[str]:
     # While a camera stands still, neither flow nor depth changes.
     still = fit.EYE.expand(len(pairs.K), 4, 4)
     seen = fit.middle(fit.residuals(pairs, still)).nan_to_num(0.0)
-    moves = torch.maximum(seen, ego) >= _LEAST_MOVEMENT_PX
+    moves = torch.maximum(seen, ego) >= REST_PX
     has_depth, known = pairs.now.isfinite().flatten(1).any(1), ~pairs.depth.isnan()
     number = known.sum(-1) * pairs.depth.isfinite().any(-1)  # the sky alone has no depth to judge
     return [
         "depth is nowhere known" if not is_known
-        else "too few pixels are known" if count < _LEAST_PIXELS
+        else "too few pixels are known" if count < 2 * FEW_PIXELS
         else "" if is_moving else _STILL
         for is_known, count, is_moving in zip(*map(Tensor.tolist, (has_depth, number, moves)))
     ]  # fmt: skip
@@ -122,13 +118,13 @@ def tested(reasons: Sequence[str]) -> list[int]:
     """Returns the pairs to test: those that move, and those at rest if few do."""
     moving = [i for i, why in enumerate(reasons) if not why]
     known = [i for i, why in enumerate(reasons) if why in ("", _STILL)]
-    return moving if len(moving) >= _FEWEST else known
+    return moving if len(moving) > FEW else known
 
 
 def note_on_untested(reasons: Sequence[str]) -> list[str]:
     """Returns a note on pairs that tell little, if they are many."""
     few = [why for why in reasons if why]
-    if len(few) < _MANY_UNTESTED * len(reasons):
+    if len(few) < MANY * len(reasons):
         return []
     return [f"{len(few)} of {len(reasons)} pairs tell little: {max(few, key=few.count)}"]
 

@@ -8,22 +8,15 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from flowrep.diagnosis.competition import Competition
-from flowrep.diagnosis.explanation import SURE, Explanation
+from flowrep.diagnosis.explanation import Explanation
 from flowrep.diagnosis.fit import Pairs, length, median, middle, residuals
+from flowrep.diagnosis.limits import ALIKE, FEW, HARMLESS, MANY, REST_PX, SURE
 from flowrep.diagnosis.pictures import best_of
 from flowrep.diagnosis.poses import most_noise_px
 from flowrep.diagnosis.rivals import Rival
 
-# An error that is smaller than one of these does nobody harm; one of three times that is no longer
-# "right".
-_HARMLESS_PX = 0.05
-_HARMLESS = 0.05  # of the flow's length
-_REST_PX = 0.25  # flow of a camera at rest: there is none but poses' noise to be wrong
-_TOLD = 3  # explanations at most, the likeliest
-_ALIKE = 3.0  # nats: explanations that aren't worse than another by more fit alike
 _ALIKE_SHARE = 0.7  # of a vague one's nats: a mistake with a name explains as much
 _NOISE = 3.0  # times the noise: differences below it may be noise
-_MANY = 0.2  # of all pairs: if poses of so many don't fit, they are wrong
 
 
 @dataclass(frozen=True)
@@ -105,15 +98,17 @@ class _Case:
 
     def __init__(self, found: Competition) -> None:
         self.found, self.recorded, self.pairs = found, found.recorded, found.recorded.pairs
-        self.harmless_px = max(_HARMLESS_PX, _HARMLESS * found.flow_px)
-        self.unsure_px = 3 * self.harmless_px if found.flow_px > _REST_PX else _REST_PX
+        px, share = HARMLESS
+        self.harmless_px = max(px, share * found.flow_px)
+        # At rest, there is no flow but that of poses' noise to be wrong.
+        self.unsure_px = 3 * self.harmless_px if found.flow_px > REST_PX else REST_PX
         self.rough_px = max(most_noise_px(self.pairs, found.flow_px), self.harmless_px)
         self.noise_px = found.noise.typical_px
         self.effects_px = {each: each.effect_px(self.recorded) for each in found.others}
         self.notes: list[str] = []
         # Flow's errors that are alike in all pictures, so that more pictures don't show them.
         is_biased = self.pairs.is_estimated
-        self.bias_px = _HARMLESS_PX + _HARMLESS * found.flow_px if is_biased else 0.0
+        self.bias_px = px + share * found.flow_px if is_biased else 0.0
         self.size = f"flow: {found.flow_px:.2g} px"
         self.unknown = f"and none of {len(found.rivals)} known mistakes explains it"
         self.error_px = self.poses_px = math.nan
@@ -128,7 +123,7 @@ class _Case:
         return [
             px
             for each, px in self.effects_px.items()
-            if each.nats > self.recorded.nats - _ALIKE
+            if each.nats > self.recorded.nats - ALIKE
             and self.found.is_seen(each)
             and px > _NOISE * noise.get(each.rival.subject, 0.0)
         ]
@@ -147,7 +142,7 @@ class _Case:
     ) -> Diagnosis | None:
         """Returns the verdict if other explanations than the data as recorded are likelier."""
         least_px = max(self.harmless_px, self.bias_px, 2 * self.noise_px * self.pairs.is_estimated)
-        if self.found.flow_px < _REST_PX:
+        if self.found.flow_px < REST_PX:
             least_px = max(least_px, self.rough_px)
         if self.recorded.poses is not None:  # what pictures don't show is no mistake for certain
             least_px = max(least_px, self.recorded.systematic_px[1])
@@ -186,8 +181,8 @@ class _Case:
         is_bad = poses.is_bad & is_world & (off_px > _NOISE * poses.sigma_px)
         is_bad &= off_px > max(_NOISE * deviation_px, self.rough_px)
         bad = [name for name, is_one in zip(names, is_bad.tolist()) if is_one]
-        many = 0.5 if self.pairs.is_estimated else _MANY
-        if len(bad) >= max(3, many * len(names)):
+        many = 0.5 if self.pairs.is_estimated else MANY
+        if len(bad) >= max(FEW, many * len(names)):
             why = f"poses of {len(bad)} in {len(names)} pairs don't fit: {', '.join(bad)}"
             if self.pairs.is_estimated:
                 return self._diagnosis("can't tell", f"{why}, or flow was estimated wrongly")
@@ -220,14 +215,14 @@ class _Case:
     def right(self) -> Diagnosis:
         """Returns the verdict if nothing speaks against the data."""
         outliers = 1 - float(self.recorded.shown.shares.amax(0).mean())
-        if outliers > _HARMLESS and self.pairs.by_flow:
+        if outliers > HARMLESS[1] and self.pairs.by_flow:
             note = f"{outliers:.0%} of pixels don't fit: they move, or depth is wrong there"
             self.notes.append(note)
         noise = f"({self.size}), beside noise of {self.noise_px:.2g} px"
         if self.recorded.poses is None:
             self.notes.append("poses, K and the unit of depth are not tested")
             return self._diagnosis("right", f"one motion explains raw flow and depth {noise}")
-        if self.found.flow_px < _REST_PX:
+        if self.found.flow_px < REST_PX:
             self.notes.append("the camera hardly moves: K and depth are not tested")
         parts = "raw flow, " * self.pairs.by_flow + "depth, K, the camera's motion"
         words = f"{parts} agree to within {self.error_px:.2g} px {noise}"
@@ -247,7 +242,7 @@ def _likeliest(
     """
     sure = {each: each.sure_nats(found.recorded) for each in found.others}
     most = max(sure.values(), default=0.0)
-    ranked = sorted(sure, key=lambda each: (-min(sure[each], most - _ALIKE), -each.nats))
+    ranked = sorted(sure, key=lambda each: (-min(sure[each], most - ALIKE), -each.nats))
     named = [each for each in ranked if not each.rival.is_vague]
     if named and sure[named[0]] > _ALIKE_SHARE * sure[ranked[0]]:
         ranked = named  # what is left may be a second mistake
@@ -264,12 +259,12 @@ def _likeliest(
     alike = [
         each
         for each in named
-        if first.sure_nats(each) <= _ALIKE and sure[each] > 0 and effects[each] > least_px
+        if first.sure_nats(each) <= ALIKE and sure[each] > 0 and effects[each] > least_px
     ]
     alike = sorted(alike, key=lambda each: -each.nats)
     # Of those with one subject, the ones with more numbers than needed say nothing more.
     fewest = {e.rival.subject: len(e.n) for e in sorted(alike, key=lambda e: -len(e.n))}
-    return [each for each in alike if len(each.n) <= fewest[each.rival.subject] + 1][:_TOLD]
+    return [each for each in alike if len(each.n) <= fewest[each.rival.subject] + 1][:FEW]
 
 
 def _left_px(each: Explanation) -> float:
