@@ -89,6 +89,12 @@ def test_flow_that_mostly_follows_no_motion_is_not_called_right():
     assert (found.verdict, "follow no motion" in found.words) == ("can't tell", True)
 
 
+def test_a_unit_by_which_all_is_far_away_explains_nothing():
+    # Depth looks the same wherever the camera is on this street, and of far things always.
+    _, found, _ = outcome(drawn(74154), *mistaken(drawn(74154), 74154))
+    assert found.verdict == "can't tell"
+
+
 def test_most_poses_that_do_not_fit_estimated_flow_are_not_called_right():
     kind, found, _ = outcome(drawn(74166), *mistaken(drawn(74166), 74166))
     assert (kind, "or flow was estimated wrongly" in found.words) == ("can't tell", True)

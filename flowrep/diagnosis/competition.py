@@ -15,13 +15,10 @@ from flowrep.diagnosis.explanation import Explanation
 from flowrep.diagnosis.fit import EYE, Pairs, flow_of, length, median, residuals
 from flowrep.diagnosis.limits import SURE
 from flowrep.diagnosis.pictures import Metric, Mixture, Noise
-from flowrep.diagnosis.rivals import Rival
+from flowrep.diagnosis.rivals import FAR, NO_RIVAL, OF_NOISE, STILL, Rival
 from flowrep.geometry.egomotion import motion_of_points
 
 _SCORED = 9  # corrections of the data that compete in full, those that fit best with exact poses
-NO_RIVAL = Rival("poses", "", "", lambda pairs, n: pairs)
-STILL = Rival("poses", "", "", lambda pairs, n: pairs._replace(path=EYE.expand_as(pairs.path)))
-OF_NOISE = Rival("flow", "", "", lambda pairs, n: pairs._replace(gain=1e-3 * pairs.gain))
 
 
 class Competition:
@@ -32,6 +29,7 @@ class Competition:
         recorded: the data as recorded.
         others: each rival's.
         of_noise: that raw flow is noise, if there are rivals that change raw flow.
+        far: that all is so far away that no motion but turns shows, if there are poses.
         still: that the camera stands still.
         noise: that of all explanations.
         flow_px: the median length of flow.
@@ -57,11 +55,12 @@ class Competition:
         # Without poses, the motion that a correction makes fit isn't known yet: all compete.
         scored = _SCORED if pairs.has_poses else len(of_data)
         of_data = sorted(of_data, key=lambda each: each.misfit)[:scored]
-        recorded, still, of_noise = (
+        recorded, still, of_noise, far = (
             Candidate(rival, pairs.depth[:, :0], rival.change(pairs, pairs.depth[:, :0]))
-            for rival in (NO_RIVAL, STILL, OF_NOISE)
+            for rival in (NO_RIVAL, STILL, OF_NOISE, FAR)
         )
-        nulls = [recorded] + [of_noise] * any(each.rival.subject == "flow" for each in of_data)
+        has_flow = any(each.rival.subject == "flow" for each in of_data)
+        nulls = [recorded] + [of_noise] * has_flow + [far] * pairs.has_poses
         motions = _motions([*nulls, *of_data], starts, shown, noise)
         noises = (_noise(each.pairs, own) for each, own in zip([*nulls, *of_data], motions))
         self.noise = min(noises, key=lambda each: float(each.px.log().mean()))
@@ -70,7 +69,8 @@ class Competition:
         self._limits = self.flow_px, least_px, most_px
         explained = [self._explained(*both) for both in zip([*nulls, *of_data], motions)]
         self.recorded, *self.others = explained
-        self.of_noise = self.others.pop(0) if len(nulls) > 1 else None
+        self.of_noise = self.others.pop(0) if has_flow else None
+        self.far = self.others.pop(0) if pairs.has_poses else None
         self.others += [self._of_poses(each) for each in of_poses]
         self.still = self._of_poses(still) if pairs.has_poses else None
         self.rule_px = self.rule_nats = 0.0
@@ -80,6 +80,11 @@ class Competition:
             after = poses.compared(pairs.motion, shown, metric, *self._limits, rule)
             self.rule_px = median(rule.norm(dim=-1))
             self.rule_nats = explanation.agreed(after.nats - self.recorded.poses.nats)
+
+    def is_proven(self, other: Explanation) -> bool:
+        """Whether data also show K or depth, if it changes these: as far away, none matters."""
+        null = self.far if other.rival.subject in ("camera", "depth") else None
+        return self.is_seen(other) and (null is None or other.nats - null.nats > SURE)
 
     def is_seen(self, other: Explanation) -> bool:
         """Whether data show what it needs: raw flow beyond noise, or else a camera that moves."""

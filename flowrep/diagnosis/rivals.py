@@ -365,3 +365,10 @@ def _of_previous(pairs: Pairs, n: Tensor) -> Pairs:
 
 def _late_depth(pairs: Pairs, n: Tensor) -> Pairs:
     return _reversed(pairs, pairs.pixel - pairs.shift, pairs.now)
+
+
+# No mistakes, but what explains data that show nothing of what a mistake needs.
+NO_RIVAL = Rival("poses", "", "", lambda pairs, n: pairs)
+STILL = Rival("poses", "", "", lambda pairs, n: pairs._replace(path=EYE.expand_as(pairs.path)))
+OF_NOISE = Rival("flow", "", "", lambda pairs, n: pairs._replace(gain=1e-3 * pairs.gain))
+FAR = Rival("depth", "", "", _depth(lambda z, n: 1e4 * z))

@@ -240,7 +240,8 @@ def _likeliest(
         least_px: what a mistake with a name has to change flow by.
         vague_px: the same of one without.
     """
-    sure = {each: each.sure_nats(found.recorded) for each in found.others}
+    proven = [each for each in found.others if found.is_proven(each)]
+    sure = {each: each.sure_nats(found.recorded) for each in proven}
     most = max(sure.values(), default=0.0)
     ranked = sorted(sure, key=lambda each: (-min(sure[each], most - ALIKE), -each.nats))
     named = [each for each in ranked if not each.rival.is_vague]
@@ -251,7 +252,7 @@ def _likeliest(
     first = ranked[0]
     least_px = vague_px if first.rival.is_vague else least_px
     gain = min(sure[first], first.nats - found.recorded.nats)
-    if gain <= SURE or effects[first] <= least_px or not found.is_seen(first):
+    if gain <= SURE or effects[first] <= least_px:
         return []
     if first.rival.is_vague:
         return [first]
