@@ -101,10 +101,18 @@ def one_stands(straight_road):
 
 @pytest.fixture
 def make_street():
-    """Makes streets; not imported before, as few tests need PyBullet."""
+    """Makes streets that are closed when the test ends."""
     from flowrep.envs import StreetEnv
 
-    return StreetEnv
+    made = []
+
+    def make(*args, **kwargs):
+        made.append(StreetEnv(*args, **kwargs))
+        return made[-1]
+
+    yield make
+    for street in made:
+        street.close()
 
 
 @pytest.fixture

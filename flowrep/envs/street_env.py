@@ -22,6 +22,7 @@ from flowrep.scenes.scene import (
     CATEGORY_ID,
     Range,
     Scene,
+    check_speed,
     num_classes,
 )
 from flowrep.scenes.vehicle import YAW_SIGN, VehicleState, footprint_corners, roll, turn
@@ -79,6 +80,8 @@ def ticks_for(scene: Scene, frame_rate_hz: float, speed_mps: Range, driven_mps: 
     """Returns how many times a step tests the footprint, at the speeds of an episode."""
     groups = [group for group in scene.pedestrian_groups if group.standing < group.count]
     fastest_mps = max(((group.speed_mps or speed_mps)[1] for group in groups), default=0.0)
+    check_speed("speed", fastest_mps, scene.camera, frame_rate_hz)
+    check_speed("vehicle_speed_mps", driven_mps, scene.camera, frame_rate_hz)
     driven_hz = driven_mps * max(_CHECKS_PER_M, 1.0 / scene.vehicle.length_m)
     checks_hz = max(_CHECKS_HZ, driven_hz, fastest_mps * _CHECKS_PER_M)
     return math.ceil(checks_hz / frame_rate_hz - 1e-9)
@@ -228,6 +231,8 @@ class StreetEnv(gym.Env):
         ValueError: another argument is invalid.
     """
 
+    sensing: Sensing
+    _street: Street
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 12}  # noqa: RUF012
 
     def __init__(
@@ -250,9 +255,10 @@ class StreetEnv(gym.Env):
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self.frame_rate_hz}
         self.num_classes = num_classes(self.scene.categories)
+        ticks_for(self.scene, self.frame_rate_hz, self.speed_mps, 0.0)
+        self._camera = sensors, picture_scale
         self._episode: Episode | None = None
-        self._street = Street.shared(self.scene)
-        self.sensing = Sensing.shared(self._street, sensors, picture_scale)
+        self._open()
         self.K = self.sensing.K
         self.action_space = spaces.Discrete(len(YAW_SIGN))
         self.observation_space = self.sensing.space()
@@ -285,6 +291,8 @@ class StreetEnv(gym.Env):
     def begin(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
         """Begins an episode like `reset`, without an observation."""
         super().reset(seed=seed)
+        if self._street is None:  # closed
+            self._open()
         options = options or {}
         if "state" in options:
             if others := sorted(options.keys() - {"state"}):
@@ -301,7 +309,7 @@ class StreetEnv(gym.Env):
 
     def drive(self, action: int) -> Outcome:
         """Drives one step like `step`, without an observation."""
-        episode = self.episode
+        episode = self._opened()
         if action not in range(len(YAW_SIGN)):
             raise ValueError(
                 f"action is {action!r}; give 0 (keep the yaw rate), 1 (turn left) or 2 (turn right)"
@@ -313,7 +321,24 @@ class StreetEnv(gym.Env):
 
     def render(self) -> Any:
         """Returns the camera's picture, [H, W, 3] uint8, if the render mode is "rgb_array"."""
-        return None if self.render_mode is None else self.sensing.rgb(self.episode)
+        episode = self._opened()
+        return None if self.render_mode is None else self.sensing.rgb(episode)
+
+    def close(self) -> None:
+        """Releases the street, whose simulator closes with the last env that uses it.
+
+        `reset` opens it again; until then only the state of the episode remains.
+        """
+        self.sensing = self._street = None  # type: ignore[assignment]
+
+    def _opened(self) -> Episode:
+        if self._street is None:
+            raise RuntimeError("the env is closed: call reset() first")
+        return self.episode
+
+    def _open(self) -> None:
+        self._street = Street.shared(self.scene)
+        self.sensing = Sensing.shared(self._street, *self._camera)
 
     def get_state(self) -> dict[str, Any]:
         """Returns the complete state as JSON-serialisable data."""

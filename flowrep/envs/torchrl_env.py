@@ -106,7 +106,8 @@ def make_env(
 
     Raises:
         SceneError: the scene is invalid.
-        ValueError: an argument is invalid, or the device can't be used.
+        ValueError: an argument is invalid, the device can't be used, or there is no C++ compiler
+            for `compiled=True`.
 
     >>> env = make_env("straight_road", ["ego", "obj"], num_envs=2, seed=0)
     >>> env.rollout(3)["next", "obj"].shape

@@ -360,10 +360,19 @@ class ForeignFunction:
         return maps.set("action", actions.long())
 
 
+_FOLDERS: set[Path] = set()  # of the scripts that were loaded
+
+
 def _module(name: str) -> Any:
     if not name.endswith(".py"):
         return import_module(name)
     path = Path(name).resolve()
+    # Under a name that an earlier script imported, Python would give this one the same module.
+    for loaded, module in list(sys.modules.items()):
+        file = Path(getattr(module, "__file__", None) or "/")
+        if {file.parent, file.parent.parent} & (_FOLDERS - {path.parent}):
+            del sys.modules[loaded]
+    _FOLDERS.add(path.parent)
     sys.path.insert(0, str(path.parent))  # as Python does for a script
     spec = spec_from_file_location(f"flowrep_policy_{path.stem}", path)
     assert spec is not None

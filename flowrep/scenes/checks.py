@@ -3,6 +3,7 @@
 They run after pydantic has checked each part.
 """
 
+import math
 from collections.abc import Iterable, Iterator
 from itertools import combinations
 from typing import Any
@@ -20,8 +21,11 @@ from flowrep.scenes.scene import (
     PedestrianGroup,
     Scene,
     SceneError,
+    check_speed,
 )
 
+MOST_BOXES = 2_000
+"""Most houses and obstacles of a scene: as many take some ten seconds to build."""
 _LEAST_END_M = 1.0  # length of an end zone; the vehicle's position is tested at least every 0.42 m
 
 
@@ -30,6 +34,13 @@ def check_references(scene: Scene) -> None:
     most = 255 // len(pedestrians.PARTS)  # instance ids have 8 bits, and 0 is the static world
     if scene.num_pedestrians > most:
         raise SceneError(f"pedestrian_groups: {scene.num_pedestrians} people; give {most} or fewer")
+    speeds_mps = {"vehicle.speed_mps": scene.vehicle.speed_mps}
+    for mode, (_, highest) in scene.pedestrian_speed_mps.items():
+        speeds_mps[f"pedestrian_speed_mps.{mode}"] = highest
+    for group in scene.pedestrian_groups:
+        speeds_mps[f"pedestrian_groups.{group.name}.speed_mps"] = (group.speed_mps or (0, 0))[1]
+    for key, speed_mps in speeds_mps.items():
+        check_speed(key, speed_mps, scene.camera, scene.frame_rate_hz)
     _check_known("categories", scene.categories, CATEGORY_ID)
     for key, names in _categories_used(scene).items():
         _check_known(key, names, scene.categories)
@@ -44,6 +55,20 @@ def check_references(scene: Scene) -> None:
             raise SceneError(
                 f"{key}: {span} m is not on road {item.road!r}; stay within 0 and {length:.1f}"
             )
+    sidewalks_m = {road.name: road.sidewalk_m for road in scene.roads}
+    for i, row in enumerate(scene.building_rows):
+        if row.side in ("left", "right") and row.setback_m < (least_m := sidewalks_m[row.road]):
+            raise SceneError(
+                f"building_rows[{i}].setback_m: is {row.setback_m:g}, within the sidewalk of road "
+                f"{row.road!r}, where no house may stand; give {least_m:g} or more"
+            )
+    spans = [(row.to_m - row.from_m) / row.front_m[0] for row in scene.building_rows]
+    spans += [(row.to_m - row.from_m) / row.every_m for row in scene.obstacle_rows]
+    if (boxes := math.ceil(sum(spans)) + len(scene.obstacles)) > MOST_BOXES:
+        raise SceneError(
+            f"building_rows and obstacle_rows: have room for {boxes:,} houses and obstacles, but a "
+            f"scene has at most {MOST_BOXES:,}; give shorter rows or wider spaces"
+        )
     ends = {path.end for path in scene.paths}
     for zone in scene.zones:
         if zone.name in ends and zone.to_m - zone.from_m < _LEAST_END_M - 1e-6:

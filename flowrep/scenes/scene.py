@@ -7,7 +7,7 @@ refuses. After that these are plain dataclasses of floats and ints.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,7 +89,6 @@ Positive = Annotated[float, Strict(), Field(gt=0.0)]
 NotNegative = Annotated[float, Strict(), Field(ge=0.0)]
 Angle = Annotated[float, Strict(), Field(ge=-360.0, le=360.0)]
 HouseSide = Annotated[float, Strict(), Field(ge=1.0, le=MOST_M)]  # rows are filled house by house
-Spacing = Annotated[float, Strict(), Field(ge=0.1, le=MOST_M)]
 Count = Annotated[int, Strict(), Field(ge=1, le=1_000_000_000)]
 MOST_PX = 4096  # 4K; more would exhaust memory
 Pixels = Annotated[int, Strict(), Field(ge=1, le=MOST_PX)]
@@ -97,6 +96,9 @@ Whole = Annotated[int, Strict(), Field(ge=0)]
 Name = Annotated[str, StringConstraints(min_length=1)]
 FileName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 Point = tuple[Position, Position]
+_Part = TypeVar("_Part")
+MOST_PARTS = 1_000  # of a kind: as many take a second to check
+Parts = Annotated[tuple[_Part, ...], Field(max_length=MOST_PARTS)]
 Size3 = tuple[Length, Length, Length]
 SpeedRange = Annotated[tuple[NotNegative, NotNegative], AfterValidator(_in_order)]
 HouseRange = Annotated[tuple[HouseSide, HouseSide], AfterValidator(_in_order)]
@@ -165,6 +167,16 @@ class CameraConfig(Part):
         )
 
 
+def check_speed(key: str, speed_mps: float, camera: CameraConfig, frame_rate_hz: float) -> None:
+    """Raises SceneError if a step leads farther than the camera sees."""
+    # Two frames would have nothing in common, and the footprint is tested all along a step.
+    if speed_mps > (most_mps := camera.far_m * frame_rate_hz):
+        raise SceneError(
+            f"{key}: is {speed_mps:g} m/s, {speed_mps / frame_rate_hz:g} m in a step, but the "
+            f"camera sees {camera.far_m:g} m; give {most_mps:g} m/s or less"
+        )
+
+
 @dataclass(frozen=True)
 class VehicleConfig(Part):
     """Size, speed and turning of the vehicle."""
@@ -215,7 +227,7 @@ class Road(Part):
     """Width of the drivable ground."""
     sidewalk_m: LengthOrZero
     """Width of each sidewalk; 0 for none."""
-    pieces: Annotated[tuple[Piece, ...], Field(min_length=1)]
+    pieces: Annotated[Parts[Piece], Field(min_length=1)]
 
 
 @dataclass(frozen=True)
@@ -247,7 +259,7 @@ class Path(Part):
     """The zone in which it starts."""
     end: Name
     """The zone that has to be reached."""
-    closures: tuple[Name, ...] = ()
+    closures: Parts[Name] = ()
     """The closures that are present in its episodes."""
 
 
@@ -290,7 +302,7 @@ class Walk(Part):
     """The other end."""
     offset_m: Position = 0.0
     """Distance of a walk along a road to the left of its centreline."""
-    points_m: tuple[Point, ...] = ()
+    points_m: Parts[Point] = ()
     """The points [x, y] that a walk connects."""
 
     def __post_init__(self) -> None:
@@ -390,7 +402,7 @@ class ObstacleRow(Part):
     """Where the first one stands."""
     to_m: Position
     """Where the row ends."""
-    every_m: Spacing
+    every_m: Length
     """Distance from one to the next."""
     size_m: Size3
     """As of an obstacle."""
@@ -423,9 +435,9 @@ class Scene(Part):
     time_limit_steps: Count
     """The longest episode in steps; at another frame rate, the limit in seconds stays the same."""
     categories: Annotated[
-        tuple[Name, ...],
+        Parts[Name],
         AfterValidator(_named_once),
-        BeforeValidator(_all_or_named, json_schema_input_type=tuple[Name, ...] | Literal["all"]),
+        BeforeValidator(_all_or_named, json_schema_input_type=Parts[Name] | Literal["all"]),
     ]
     """The classes that the semantic map may show, whose ids are in `flowrep.scenes.CATEGORY_ID`; an
     agent that reads them can drive wherever there are no others. `all` stands for those of all
@@ -434,19 +446,19 @@ class Scene(Part):
     """Seed of the houses' sizes and fronts, which are drawn once for the scene."""
     camera: CameraConfig
     vehicle: VehicleConfig
-    roads: Annotated[tuple[Road, ...], Field(min_length=1), AfterValidator(_named_once)]
-    zones: Annotated[tuple[Zone, ...], Field(min_length=1), AfterValidator(_named_once)]
-    paths: Annotated[tuple[Path, ...], Field(min_length=1), AfterValidator(_named_once)]
+    roads: Annotated[Parts[Road], Field(min_length=1), AfterValidator(_named_once)]
+    zones: Annotated[Parts[Zone], Field(min_length=1), AfterValidator(_named_once)]
+    paths: Annotated[Parts[Path], Field(min_length=1), AfterValidator(_named_once)]
     pedestrian_speed_mps: Annotated[dict[SpeedMode, SpeedRange], AfterValidator(_all_modes)]
     """[lowest, highest] speed of people in each of the modes low, normal and high."""
     pedestrian_size: Annotated[float, Strict(), Field(ge=0.1, le=3.0)] = 1.0
     """Size of people: at 1 they are 1.75 m tall, and 0.6 m wide with swinging arms."""
-    pedestrian_groups: Annotated[tuple[PedestrianGroup, ...], AfterValidator(_named_once)] = ()
-    building_rows: tuple[BuildingRow, ...] = ()
+    pedestrian_groups: Annotated[Parts[PedestrianGroup], AfterValidator(_named_once)] = ()
+    building_rows: Parts[BuildingRow] = ()
     obstacles: tuple[Obstacle, ...] = ()
-    obstacle_rows: tuple[ObstacleRow, ...] = ()
-    closures: Annotated[tuple[Closure, ...], AfterValidator(_named_once)] = ()
-    crosswalks: tuple[Crosswalk, ...] = ()
+    obstacle_rows: Parts[ObstacleRow] = ()
+    closures: Annotated[Parts[Closure], AfterValidator(_named_once)] = ()
+    crosswalks: Parts[Crosswalk] = ()
     terrain_m: LengthOrZero = 0.0
     """How far grass extends beyond the roads' bounding box, which it fills; 0 for none."""
     corner_radius_m: LengthOrZero = 0.0

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from flowrep.geometry import adapt_pose
 from flowrep.geometry.pose import POSE_SHAPES
-from flowrep.sequences.files import UNREADABLE, read_lines
+from flowrep.sequences.files import UNREADABLE, read_lines, regular
 from flowrep.sequences.recording import Pose, SequenceError
 
 Matrix: TypeAlias = NDArray[np.float64]
@@ -72,7 +72,7 @@ def read_camera(path: Path) -> Camera:
         'picture, "distortion" and "lens"'
     )
     try:
-        text = path.read_text("utf-8-sig", "replace")
+        text = regular(path).read_text("utf-8-sig", "replace")
         if path.name.endswith(".txt"):
             given = _colmap(path)
         elif path.suffix == ".json":

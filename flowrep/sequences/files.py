@@ -5,7 +5,10 @@ An invalid file raises `SequenceError`, a missing one `OSError`; both name the f
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
+import math
 import re
 import struct
 from collections.abc import Collection, Sequence
@@ -15,6 +18,8 @@ from typing import Any, Literal, TypeAlias
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+from PIL.Image import DecompressionBombError as _Bomb
 
 from flowrep.extras import require
 from flowrep.sequences.recording import SequenceError
@@ -34,6 +39,8 @@ FLO_TAG = 202021.25
 KITTI_BOUNDS = (-512.0, 511.984375)  # steps of 1/64 px, 0 at 2^15
 _NUMBER = re.compile(r"[-+]?(nan|inf|\.?\d[\d.]*(e[-+]?\d+)?)", re.IGNORECASE)
 UNREADABLE = (ValueError, LookupError, TypeError, ArithmeticError, RecursionError, struct.error)
+# More is no frame and no table, but a mistake or a bomb: a small file may ask for all memory.
+_MOST_BYTES, _MOST_PIXELS = 1 << 30, 100_000_000
 _FLO_UNKNOWN, _FLO_LARGEST = 1e10, 1e9  # written for unknown flow; larger values are unknown
 
 
@@ -80,9 +87,25 @@ def with_suffix(path: Path, kind: str) -> Path:
     return next((found for found in paths if found.exists()), path)
 
 
+def regular(path: Path, most_bytes: float = _MOST_BYTES) -> Path:
+    """Returns a path, unless it is a pipe, from which reading might never end, or very large."""
+    if path.exists() and not path.is_file():
+        raise SequenceError(path, "is not a regular file")
+    if path.exists() and path.stat().st_size > most_bytes:
+        raise SequenceError(path, f"has {path.stat().st_size:,} bytes, at most {most_bytes:,} fit")
+    return path
+
+
+def check_size(path: Path, *size: int) -> None:
+    """Raises SequenceError for more pixels than a picture has, before memory is taken for them."""
+    if math.prod(size) > _MOST_PIXELS:
+        says = " x ".join(map(str, size))
+        raise SequenceError(path, f"has {says} pixels or numbers, at most {_MOST_PIXELS:,} fit")
+
+
 def read_lines(path: Path) -> list[str]:
     """Returns the non-empty lines; `#` starts a comment."""
-    lines = map(str.strip, path.read_text("utf-8-sig", errors="replace").splitlines())
+    lines = map(str.strip, regular(path).read_text("utf-8-sig", errors="replace").splitlines())
     return [line for line in lines if line and not line.startswith("#")]
 
 
@@ -105,7 +128,7 @@ def read_table(
             array = np.array(read_json(path) if suffix == ".json" else read_array(path), np.float64)
             table = array.reshape(len(array) if array.ndim > 1 else array.size, -1)
         elif suffix == ".cam":
-            tag, *row = struct.unpack("<f21d", path.read_bytes())
+            tag, *row = struct.unpack("<f21d", regular(path).read_bytes())
             table = np.array([row] if tag == FLO_TAG else [])
         else:
             lines = [text.replace(",", " ") for text in read_lines(path.with_name(file))]
@@ -139,7 +162,7 @@ def read_json(path: Path) -> Any:
     name, _, keys = path.name.partition(":")
     path = path.with_name(name)
     try:
-        return _found(json.loads(path.read_bytes()), keys.split("."))
+        return _found(json.loads(regular(path).read_bytes()), keys.split("."))
     except UNREADABLE as error:
         raise SequenceError(path, f"has nothing at {keys}: {error!r}") from None
 
@@ -161,10 +184,11 @@ def read_array(path: Path) -> NDArray[Any]:
     try:
         if suffix == ".npy":
             # Memory-mapped; otherwise, memory for the size in a broken header would be allocated.
-            mapped = np.load(path, mmap_mode="r")
+            mapped = np.load(regular(path), mmap_mode="r")
+            check_size(path, *mapped.shape)
             array = np.array(mapped) if isinstance(mapped, np.ndarray) else None
         elif suffix in (".flo", ".dpt"):
-            data = path.read_bytes()
+            data = regular(path).read_bytes()
             tag, width, height = struct.unpack_from("<fii", data)
             if tag == FLO_TAG and min(width, height) > 0:
                 values = np.frombuffer(data, "<f4", offset=12).astype(np.float32)
@@ -174,21 +198,23 @@ def read_array(path: Path) -> NDArray[Any]:
         elif suffix in _HDF5:
             array = _read_hdf5(path)
         else:
-            array = decoded(path.read_bytes())
-    except (ValueError, EOFError, RuntimeError, struct.error, cv2.error) as error:
+            array = decoded(path, regular(path).read_bytes())
+    except (ValueError, EOFError, RuntimeError, struct.error, cv2.error, _Bomb) as error:
         raise SequenceError(path, f"can't be read as {suffix}: {error}") from None
     if array is None:
         raise SequenceError(path, f"is no {suffix} file, or was cut off")
     return array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
 
 
-def decoded(data: bytes) -> NDArray[Any]:
+def decoded(path: Path, data: bytes) -> NDArray[Any]:
     """Returns the picture in a file's bytes, red first; ValueError for none or a part of one."""
     # Before version 5, OpenCV silently fills a truncated picture with grey, so look for the end
     # marker. Some cameras write a few bytes after it.
     end = {b"\x89P": b"IEND", b"\xff\xd8": b"\xff\xd9"}.get(data[:2], b"")
     if not data or end not in data[-4096:]:
         raise ValueError("it is no picture, or was cut off")
+    with contextlib.suppress(UnidentifiedImageError):  # OpenCV reads more kinds, e.g. .pfm
+        check_size(path, *Image.open(io.BytesIO(data)).size)
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if picture is None:
         raise ValueError("OpenCV can't decode it")
@@ -202,7 +228,9 @@ def _read_exr(path: Path) -> NDArray[Any]:
     require("reading .exr", "exr", "OpenEXR")
     import OpenEXR
 
-    planes = OpenEXR.File(str(path), separate_channels=True).channels()
+    window = OpenEXR.File(str(regular(path)), header_only=True).header()["dataWindow"]
+    check_size(path, *(int(last) - int(first) + 1 for first, last in zip(*window)))
+    planes = OpenEXR.File(str(regular(path)), separate_channels=True).channels()
     name = min(planes, key=lambda name: (f"ZRYV{name[-1]}".index(name[-1]), name))
     pixels: NDArray[Any] = planes[name].pixels
     return pixels
@@ -215,11 +243,12 @@ def _read_hdf5(path: Path) -> NDArray[Any]:
 
     arrays: dict[str, Any] = {}
     try:
-        with h5py.File(path) as file:
+        with h5py.File(regular(path)) as file:
             file.visititems(lambda name, x: arrays.update({name: x} if hasattr(x, "shape") else {}))
             if len(arrays) != 1:
                 raise SequenceError(path, f"holds {len(arrays)} arrays, not one: {[*arrays][:8]}")
             (stored,) = arrays.values()
+            check_size(path, *stored.shape)
             return np.array(stored)
     except OSError as error:  # which doesn't name the file
         raise SequenceError(path, f"can't be read as HDF5: {error}") from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from flowrep.extras import require
 from flowrep.sequences import calibration, matching
 from flowrep.sequences.calibration import Lens, Matrix, as_pose
-from flowrep.sequences.files import decoded
+from flowrep.sequences.files import decoded, regular
 from flowrep.sequences.recording import Frame, Pose, Recording, SequenceError
 
 # Encodings by their type and channels; of colour, the order in which red, green and blue stand.
@@ -72,8 +73,9 @@ class RosBag(Recording):
         self.path, self.tolerance_s = Path(path), tolerance_s
         self._written: dict[tuple[str, int], int] = {}  # when, by topic and stamp
         with self._naming():
+            source = self.path if self.path.is_dir() else regular(self.path, math.inf)
             older = get_typestore(Stores.LATEST)  # for bags that hold no definitions
-            self._reader: Any = AnyReader([self.path], default_typestore=older)
+            self._reader: Any = AnyReader([source], default_typestore=older)
             self._reader.open()
             self._kinds = {c.topic: c.msgtype.split("/")[-1] for c in self._reader.connections}
             colour, depths = self._pictures()
@@ -254,8 +256,8 @@ class RosBag(Recording):
     def _read(self, index: int) -> Frame:
         stamp, depth_stamp, pose, position = self._moments[index]
         with self._naming():
-            rgb: Any = _colour(self._image(self._rgb, stamp))
-            depth: Any = _metres(self._image(self._depth, depth_stamp))
+            rgb: Any = _colour(self._image(self._rgb, stamp), self.path)
+            depth: Any = _metres(self._image(self._depth, depth_stamp), self.path)
         rgb, depth = self._rig(rgb, depth, self.K, self._K_depth)
         options: Any = {"timestamp_s": stamp * 1e-9, "position": position}
         return Frame(_name(stamp), self.path, pose, self.K, depth, rgb, **options)
@@ -277,21 +279,21 @@ def _plane(message: Any, dtype: str, channels: int) -> NDArray[Any]:
     return pixels.reshape(message.height, message.width, channels)
 
 
-def _colour(message: Any) -> NDArray[np.uint8]:
+def _colour(message: Any, path: Path) -> NDArray[np.uint8]:
     if hasattr(message, "encoding"):
         channels, order = _COLOUR[message.encoding]
         return np.ascontiguousarray(_plane(message, "u1", channels)[..., order])
-    picture = decoded(bytes(message.data))
+    picture = decoded(path, bytes(message.data))
     return picture[..., :3] if picture.ndim == 3 else np.stack(3 * [picture], -1)
 
 
-def _metres(message: Any) -> NDArray[np.float32]:
+def _metres(message: Any, path: Path) -> NDArray[np.float32]:
     """Returns depth in metres; 0 and what isn't finite is missing (REP 118)."""
     if hasattr(message, "encoding"):
         stored: Any = _plane(message, _DEPTH[message.encoding], 1)[..., 0]
     else:  # compressed_depth_image_transport: 12 bytes, then a PNG
         data = bytes(message.data)
-        stored = decoded(data[12:])
+        stored = decoded(path, data[12:])
         if message.format.startswith("32FC1"):  # a / depth + b
             _, a, b = struct.unpack_from("<iff", data)
             stored = np.where(stored == 0, np.nan, a / (stored - np.float32(b)))

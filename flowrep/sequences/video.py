@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from itertools import count, islice
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrep.sequences.calibration import camera_matrix
+from flowrep.sequences.files import regular
 from flowrep.sequences.recording import Frame, SequenceError
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv")
@@ -31,7 +33,7 @@ class StillVideo:
     notes: tuple[str, ...] = ()
 
     def __init__(self, source: str | Path | int, *, still: bool = False) -> None:
-        self.source = Path(str(source))
+        self.source = regular(Path(str(source)), math.inf)
         if not still:
             cause = "a video has no depth, without which flow of a moving camera can't be split; "
             remedy = "if it stands still say format.still=true, else bring depth too: format=frames"
@@ -67,7 +69,7 @@ class VideoPictures:
     """The pictures of a video file by their numbers."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        self.path = regular(path, math.inf)
         self._next, self._pictures = 0, iter(list[NDArray[np.uint8]]())
 
     def __getitem__(self, index: int) -> NDArray[np.uint8]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import inspect
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Sequence
 from typing import Any, Literal, NamedTuple, TypeAlias
@@ -14,14 +15,7 @@ from tensordict.utils import NestedKey, expand_as_right
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs import EnvBase
-from torchrl.envs.transforms import (
-    Compose,
-    ConditionalPolicySwitch,
-    FrameSkipTransform,
-    MultiAction,
-    NoopResetEnv,
-    Transform,
-)
+from torchrl.envs.transforms import Compose, Transform
 
 # One key (a string, or a tuple of strings if nested) or a list of keys, as in TorchRL.
 Keys: TypeAlias = NestedKey | list[NestedKey]
@@ -51,10 +45,6 @@ class Reads(NamedTuple):
         sizes = ", ".join(str(size) for size in self.shape)
         return f"{'' if self.kind == 'any' else self.kind + ' '}[*B, {sizes}]"
 
-
-# TorchRL's transforms that step the env at a reset, and those that do so in a step.
-_STEP_AT_RESETS = (NoopResetEnv, ConditionalPolicySwitch)
-_STEP_MORE = (*_STEP_AT_RESETS, FrameSkipTransform, MultiAction)
 
 _UNSIGNED = (torch.uint16, torch.uint32, torch.uint64)
 
@@ -211,9 +201,9 @@ class MapTransform(Transform):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        env = None if torch.compiler.is_compiling() else _outermost(self)
-        if isinstance(env, EnvBase):
-            self._check_steps(_flat(env.transform))
+        # Loops that read no specs don't call `transform_input_spec`.
+        if not torch.compiler.is_compiling() and isinstance(_outermost(self), EnvBase):
+            self._check_steps(self._beside())
         # TorchRL's `_reset` doesn't call the transform.
         begins = tensordict.get("_reset", None)
         rows = None
@@ -257,6 +247,26 @@ class MapTransform(Transform):
         self._write(observation_spec, self.output_specs(*specs), "output_specs")
         return observation_spec
 
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        """Returns the specs unchanged; refuses what the env steps over, see `Raises`."""
+        input_spec = super().transform_input_spec(input_spec)
+        if self.container is not None:
+            self._check_steps(self._beside())
+        return input_spec
+
+    def _beside(self) -> list[Any]:
+        """Returns all transforms of its env or of its outermost Compose, in their order."""
+        outermost = _outermost(self)
+        is_env, flat = isinstance(outermost, EnvBase), []
+        waiting = [outermost.transform if is_env else outermost]
+        while waiting:
+            transform = waiting.pop(0)
+            if isinstance(transform, Compose):
+                waiting = [*transform.transforms, *waiting]
+            else:
+                flat.append(transform)
+        return flat
+
     def _check_steps(self, transforms: list[Any]) -> None:
         """Raises ValueError if the env takes several steps where a motion or flow spans one."""
         before = [x for x in transforms[: transforms.index(self)] if isinstance(x, MapTransform)]
@@ -266,7 +276,7 @@ class MapTransform(Transform):
         ]
         if not of_env:
             return
-        steppers = [type(x).__name__ for x in transforms if isinstance(x, _STEP_MORE)]
+        steppers = [type(x).__name__ for x in transforms if _methods_that_step(x.__class__)]
         if self.container.base_env.__dict__.get("wrapper_frame_skip", 1) > 1:
             steppers.append("frame_skip")
         if steppers:
@@ -286,13 +296,6 @@ def _outermost(transform: Any) -> Any:
     while (held := transform.__dict__.get("_container")) and (holder := held()) is not None:
         transform = holder
     return transform
-
-
-def _flat(transform: Transform) -> list[Transform]:
-    """Returns a transform, or those in a Compose and in the ones within it, in their order."""
-    if not isinstance(transform, Compose):
-        return [transform]
-    return [each for part in transform.transforms for each in _flat(part)]
 
 
 class RecurrentTransform(MapTransform):
@@ -428,7 +431,7 @@ class RecurrentTransform(MapTransform):
                     f"{type(self).__name__}, an earlier transform, reads again at the next step: "
                     "let it write to another key, or put it first"
                 )
-            if isinstance(transform, _STEP_AT_RESETS):
+            if "_reset" in _methods_that_step(transform.__class__):
                 raise ValueError(
                     f"{type(transform).__name__} steps the env at a reset, and what "
                     f"{type(self).__name__}, an earlier transform, writes is that of its last "
@@ -466,6 +469,24 @@ def flags_of_batch(flags: Tensor, tensordict: TensorDictBase) -> Tensor:
     """Returns flags such as `done`, `[*B]` or `[*B, 1]`, as `[*B]`, the TensorDict's batch size."""
     batch_dims = tensordict.ndim
     return flags.flatten(batch_dims).any(-1) if flags.ndim > batch_dims else flags
+
+
+@functools.cache
+def _methods_that_step(kind: type[Transform]) -> set[str]:
+    """Returns the names of a transform's methods that step its env, such as TorchRL's frame skip.
+
+    TorchRL has no flag for it. But a transform reaches its env as its `parent`, so a method's code
+    names this attribute beside a step.
+    """
+    code = {
+        name: {*inspect.unwrap(method).__code__.co_names}
+        for each in reversed(kind.__mro__)
+        if each not in Transform.__mro__
+        for name, method in vars(each).items()
+        if inspect.isfunction(method)
+    }
+    steps, env = {"step", "_step", "rand_step"}, {"parent", "base_env"}
+    return {name for name, names in code.items() if names & steps and names & env}
 
 
 @functools.cache

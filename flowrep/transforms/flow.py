@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+import shutil
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
 
@@ -158,6 +161,8 @@ class FlowTransform(CameraTransform):
         self.out_keys: list[NestedKey] = [*keys, *self.masks]
         flows = [output for output in outputs if output != "valid"]
         self.scales = _scales(scale, flows)
+        if compiled:
+            _check_compiler()
         self.compiled = bool(compiled)
 
     def _at_one_precision(self, maps: Sequence[Tensor]) -> list[Any]:
@@ -231,7 +236,8 @@ class RawFlow(FlowTransform):
             `_valid` appended: `("sensor", "flow_valid")` for `("sensor", "flow")`.
 
     Raises:
-        ValueError: an option or K is invalid. In calls, see `check_intrinsics`.
+        ValueError: an option or K is invalid, or `compiled=True` without a C++ compiler. In calls,
+            see `check_intrinsics`.
         RuntimeError: in calls, for an id without a row of `instance_motion`.
 
     Example:
@@ -285,9 +291,20 @@ class RawFlow(FlowTransform):
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
         """Returns the outputs' specs; ValueError unless ids' spec has a number for each motion."""
         _, ids, motions, *_ = specs
-        bodies, rows = _highest_id(ids), motions.shape[-3]
-        # Without bodies, an id is wrong or the static world's.
-        if rows > 1 and bodies != rows - 1:
+        if motions.shape[-3] > 1:  # without bodies, an id is wrong or the static world's
+            self._check_rows(_highest_id(ids), motions)
+        return super().output_specs(*specs)
+
+    def _check_values(self, tensordict: TensorDictBase, *, waits: bool = False) -> None:
+        super()._check_values(tensordict, waits=waits)
+        # A batch has no specs, but may have an InstanceIds beside it.
+        _, ids, motions, *_ = self.in_keys
+        for each in self._beside():
+            if ids in each.out_keys and hasattr(each, "body_ids") and motions in tensordict:
+                self._check_rows(len(each.body_ids), tensordict[motions])
+
+    def _check_rows(self, bodies: int | None, motions: Tensor | TensorSpec) -> None:
+        if bodies != (rows := motions.shape[-3]) - 1:
             found = "has a spec of any id" if bodies is None else f"has ids from 0 to {bodies}"
             raise ValueError(
                 f"{self.in_keys[1]!r} {found}, and {self.in_keys[2]!r} has {rows} rows: that must "
@@ -295,7 +312,6 @@ class RawFlow(FlowTransform):
                 "(Poses are N, of bodies alone: InstanceMotion adds the static world's row.) "
                 "InstanceIds, with one id for each pose in their order, declares its ids"
             )
-        return super().output_specs(*specs)
 
 
 class FlowFactorize(FlowTransform):
@@ -502,3 +518,13 @@ def as_intrinsics(intrinsics: Tensor | Sequence[Sequence[float]]) -> Tensor:
         )
     geometry.check_intrinsics("intrinsics", K)
     return K
+
+
+def _check_compiler() -> None:
+    """Raises ValueError if the C++ compiler that `torch.compile` calls is not installed."""
+    compiler = os.environ.get("CXX", "clang++" if sys.platform == "darwin" else "g++")
+    if sys.platform != "win32" and shutil.which(compiler) is None:
+        raise ValueError(
+            f"compiled=True needs a C++ compiler, and {compiler} is not on PATH: install it, name "
+            "another one in the environment variable CXX, or set compiled=False"
+        )

@@ -21,9 +21,13 @@ from flowrep.transforms.base import (
     MapTransform,
     check_distinct_keys,
     has_values,
+    signed,
 )
 
 Encoding = Literal["ids", "onehot"]
+
+_CALLS_PER_LOOK = 100  # on a GPU, one call of this many checks ids: each check waits for them
+_LINK_BIT = 24  # PyBullet's ids: body + (link + 1 << 24)
 
 
 class Rgb(MapTransform):
@@ -186,17 +190,23 @@ class InstanceIds(MapTransform):
     | ids | `("sensor", "instance")` | uint8 `[*B, 1, H, W]` (int32 from 256 bodies) | 0 … N | row |
 
     Ids without a row become 0, the static world. A warning names each of them once, with its share
-    of the pixels, unless it is negative (a background) or one of `static_ids`. Such ids are
-    searched for at resets and at the root of batches, not in steps; on a GPU, which waits for the
-    search, only where all envs are reset.
+    of the pixels, unless it is negative (a background) or one of `static_ids`. Every call searches
+    for such ids until the first warning; after it, and always on a GPU, one call in a hundred does.
+
+    PyBullet's ids with links (`ER_SEGMENTATION_MASK_OBJECT_AND_LINKINDEX`) hold the body's id in
+    the low 24 bits and 1 + the link's index above them. For these, `body_ids` lists (body, link)
+    pairs, in the order of the links' poses; the base is link -1.
 
     Args:
-        body_ids: the ids of the bodies, in the order of their poses: the first becomes 1.
+        body_ids: the ids of the bodies, or (body, link) pairs, in the order of their poses: the
+            first becomes 1.
         static_ids: ids of what stands still, such as the floor.
+        links_as_body: whether PyBullet's links that `body_ids` lacks get their body's row.
         out_keys: must differ from `in_keys`, so that nothing is converted twice.
 
     Raises:
-        ValueError: `body_ids` lists a body twice.
+        ValueError: `body_ids` lists a body twice; or, in calls, the ids are PyBullet's with links,
+            `body_ids` lists bodies without links, and `links_as_body` is False.
 
     Example:
         >>> from tensordict import TensorDict
@@ -210,36 +220,62 @@ class InstanceIds(MapTransform):
 
     def __init__(
         self,
-        body_ids: Sequence[int],
+        body_ids: Sequence[int | tuple[int, int]],
         *,
         static_ids: Sequence[int] = (0,),
+        links_as_body: bool = False,
         in_keys: Keys = "segmentation",
         out_keys: Keys = ("sensor", "instance"),
     ) -> None:
         super().__init__([IDS], in_keys, out_keys)
         check_distinct_keys(self)
-        ids = torch.tensor([int(each) for each in body_ids], dtype=torch.long)
-        if len(ids.unique()) != len(ids):
+        packed = [_packed(*x) if isinstance(x, (tuple, list)) else int(x) for x in body_ids]
+        if len(set(packed)) != len(packed):
             raise ValueError(f"body_ids must list each body once, got {list(body_ids)}")
+        ids = torch.tensor(packed, dtype=torch.long)
         self.register_buffer("body_ids", ids, persistent=False)
+        self.links_as_body = bool(links_as_body)
         self._static = {int(each) for each in static_ids}
+        self._calls_to_skip = 0
 
     def compute(self, ids: Tensor) -> tuple[Tensor]:
         """Returns each pixel's row."""
-        return (geometry.instance_rows(ids, self.body_ids),)
+        rows = geometry.instance_rows(ids, self.body_ids)
+        if self.links_as_body:
+            bodies = geometry.instance_rows(_body_of(ids), self.body_ids)
+            rows = torch.where(rows == 0, bodies, rows)
+        return (rows,)
 
-    def _check_values(self, tensordict: TensorDictBase, *, waits: bool = False) -> None:
-        if tensordict.get(self.in_keys[0], None) is None:
-            return
-        (ids,) = self._read(tensordict)
-        if not (has_values(ids) and (waits or ids.is_cpu)):
-            return
-        known = [*self.body_ids.tolist(), *self._static]
-        without = ~torch.isin(ids, torch.tensor(known, device=ids.device)) & (ids >= 0)
-        if not without.any():
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        next_tensordict = super()._call(next_tensordict)
+        ids = next_tensordict.get(self.in_keys[0], None)
+        if ids is None or not has_values(ids):
+            return next_tensordict
+        self._calls_to_skip -= 1
+        if self._calls_to_skip < 0:
+            self._calls_to_skip = _CALLS_PER_LOOK - 1 if ids.is_cuda else 0
+            ids = ids.to(signed(ids.dtype))
+            self._name_ids_without_row(ids, next_tensordict[self.out_keys[0]])
+        return next_tensordict
+
+    def _name_ids_without_row(self, ids: Tensor, rows: Tensor) -> None:
+        """Warns of ids that count as the static world; ValueError if they are bodies' links."""
+        without = (rows == 0) & (ids >= 0)
+        for number in self._static:
+            without &= ids != number
+        if not bool(without.any()):
             return
         numbers, counts = (x.tolist() for x in ids[without].unique(return_counts=True))
-        shares = [f"{n} ({count / ids.numel():.1%})" for n, count in zip(numbers, counts)]
+        bodies = self.body_ids.tolist()
+        if not self.links_as_body and max(bodies, default=0) < 1 << _LINK_BIT:
+            links = [n for n in numbers if n >> _LINK_BIT and n % (1 << _LINK_BIT) in bodies]
+            if links:
+                raise ValueError(
+                    f"{self.in_keys[0]!r} holds PyBullet's ids with links, for instance "
+                    f"{_named(links[0])}, but body_ids lists bodies without links: list (body, "
+                    "link) for each link with a pose, -1 for the base, or set links_as_body=True"
+                )
+        shares = [f"{_named(n)} ({count / ids.numel():.1%})" for n, count in zip(numbers, counts)]
         warnings.warn(
             f"{self.in_keys[0]!r}: ids without a row count as the static world: "
             f"{', '.join(shares[:8])} of the pixels{', ...' * (len(shares) > 8)}. If they move, "
@@ -247,6 +283,7 @@ class InstanceIds(MapTransform):
             stacklevel=2,
         )
         self._static |= set(numbers)
+        self._calls_to_skip = _CALLS_PER_LOOK - 1  # the search is another pass over the ids
 
     def output_specs(self, ids: TensorSpec) -> tuple[TensorSpec]:
         """Returns a categorical spec of 1 + N rows."""
@@ -267,3 +304,19 @@ def _check_bytes(values: Tensor, what: str, remedy: str) -> None:
         raise ValueError(
             f"{what} from {least} to {most}, but uint8 can hold only 0 to 255; {remedy}"
         )
+
+
+def _packed(body: int, link: int) -> int:
+    """Returns PyBullet's id of a body's link."""
+    return body + (link + 1 << _LINK_BIT)
+
+
+def _body_of(ids: Tensor) -> Tensor:
+    """Returns the bodies' ids, from PyBullet's ids with links; negative ids are kept."""
+    # Integers of one or two bytes can't hold links.
+    return torch.where(ids < 0, ids, ids % (1 << _LINK_BIT)) if ids.element_size() > 2 else ids
+
+
+def _named(number: int) -> str:
+    link, body = divmod(number, 1 << _LINK_BIT)
+    return f"{number} = body {body}, link {link - 1}" if link else str(number)

@@ -120,6 +120,12 @@ class Mirror(Transform):
         image = action[..., swapped] if is_one_hot else swapped[action.long()].to(action.dtype)
         tensordict["action"] = torch.where(expand_as_right(chosen, action), image, action)
         following = tensordict.get("next", None)
+        for step in (tensordict, following):
+            mask = None if step is None else step.get("action_mask", None)
+            if mask is not None:
+                step["action_mask"] = torch.where(
+                    expand_as_right(chosen, mask), mask[..., swapped], mask
+                )
         for key in self.in_keys:
             is_flow = key in self.flow_keys
             for step in (tensordict, following):

@@ -5,6 +5,10 @@ import pytest
 from flowrep.config.usage import UsageError
 from flowrep.config.yaml_file import read_yaml
 
+# Each list holds the one before twice: 2 ** 17 - 1 values and lists in line 16.
+DOUBLED = "a0: &a0 [x, x]\n" + "".join(
+    f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" for i in range(1, 60)
+)
 WRONG = {
     "a list that is not closed": (b"name: a\nroads: [1\n", ", line 3: "),
     "a key twice": (b"name: a\nname: b", ", line 2: the key 'name'"),
@@ -14,6 +18,10 @@ WRONG = {
     "a tagged date that is none": (b"a: !!timestamp x", ": "),
     "a truth that is none": (b"a: !!bool x", ": "),
     "no UTF-8": (b"name: \xff\xfe", ": "),
+    "aliases of aliases": (DOUBLED.encode(), ", line 16: its aliases"),
+    "an endless alias": (b"name: &a {b: *a}", ", line 1: an alias"),
+    "a number of 401 digits": (b"a: 1" + b"0" * 400, ", line 1: a number"),
+    "a number of 6,000 digits": (b"a: 0x1" + b"0" * 5000, ", line 1: a number"),
     "depth": (b"name: " + b"[" * 20_000, ": is nested"),
 }
 

@@ -245,6 +245,7 @@ def test_reset_options_set_speed_and_frame_rate_of_one_episode(make_street):
         ({"speed": (2.0, 1.0)}, r"speed is \(2.0, 1.0\)"),
         ({"speed": (1.0,)}, r"speed is \(1.0,\)"),
         ({"speed": None}, "speed is None"),
+        ({"speed": (1.0, 1e8)}, r"speed: is 1e\+08 m/s"),
         ({"speed": ("1", "2")}, r"speed is \('1', '2'\)"),
         ({"frame_rate_hz": 0}, r"frame_rate_hz is 0;"),
         ({"frame_rate_hz": "12"}, r"frame_rate_hz is '12'"),
@@ -295,6 +296,8 @@ def test_invalid_reset_options_are_refused(make_street, empty_road):
         ("speed", (1.0, math.nan), r"speed is \(1.0, nan\)"),
         ("state", 5, "get_state"),
         ("state", {"steps": 3}, "get_state: .*episode_seed"),
+        # A step of a twelfth of a second would lead past all that is seen, 300 m.
+        ("vehicle_speed_mps", 1e7, r"vehicle_speed_mps: is 1e\+07 m/s.* 3600 m/s"),
     ):
         with pytest.raises(ValueError, match=message):
             env.reset(options={option: value})
@@ -306,6 +309,16 @@ def test_invalid_reset_options_are_refused(make_street, empty_road):
         env.reset(options={"state": state, "path": "main"})
     last = (1 << 62) - 1
     assert env.reset(options={"episode_seed": np.int64(last)})[1]["episode_seed"] == last
+
+
+def test_a_closed_street_opens_again_with_a_reset(make_street, empty_road):
+    env = make_street(empty_road, sensors=("depth",), render_mode="rgb_array")
+    before, _ = env.reset(seed=1)
+    env.close()
+    with pytest.raises(RuntimeError, match="call reset"):
+        env.render()
+    assert same(before, env.reset(seed=1)[0])
+    assert env.render().shape == (84, 84, 3)
 
 
 def test_motion_between_two_steps_is_the_one_driven(make_street, empty_road):

@@ -1,5 +1,6 @@
 """The TorchRL env: its specs, partial resets, the same episodes in one process and in two."""
 
+import shutil
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -180,7 +181,8 @@ def test_only_sensors_that_a_transform_reads_are_rendered(make):
         assert street_envs(env)[0].sensing.names == sensors
 
 
-def test_compiled_reaches_the_flow_transforms(make):
+def test_compiled_reaches_the_flow_transforms(make, monkeypatch):
+    monkeypatch.setattr(shutil, "which", lambda name: name)
     for compiled in (False, True):
         env = make(representations=["obj"], noise={"depth_dropout": 0.1}, compiled=compiled)
         flows = [t.compiled for t in env.transform if isinstance(t, RawFlow | FlowFactorize)]

@@ -66,6 +66,17 @@ def test_make_receives_the_task_and_may_import_modules_beside_it(tmp_path):
     assert ForeignPolicy(f"{path}:make").built_for(TASK)(maps(3))["action"].tolist() == [2, 2, 2]
 
 
+def test_two_policies_import_their_own_modules_of_one_name(tmp_path):
+    for number, name in enumerate(["first", "second"]):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "my_model.py").write_text(f"SIDE = {number}\n")
+        script = "import my_model\nmake = lambda task: lambda maps: [my_model.SIDE] * len(maps)"
+        (tmp_path / name / "mine.py").write_text(script)
+    paths = (f"{tmp_path}/{name}/mine.py:make" for name in ("first", "second", "first"))
+    policies = [ForeignPolicy(path).built_for(TASK) for path in paths]
+    assert [each(maps())["action"].tolist() for each in policies] == [[0, 0], [1, 1], [0, 0]]
+
+
 @pytest.mark.parametrize(
     ("given", "said"),
     [

@@ -52,6 +52,8 @@ def refusal(data, changes):
         ({"name": "../../up"}, "name"),
         ({"roads.0.start_m": [1.0]}, "roads[0].start_m[1]"),
         ({"paths": []}, "paths"),
+        ({"roads.0.pieces": [{"straight_m": 0.01}] * 1_001}, "roads[0].pieces"),
+        ({"zones": [ON_STEM | {"name": str(i)} for i in range(20_000)]}, "zones"),
         ({"pedestrian_groups.0.speed_mps": [2, 1]}, "pedestrian_groups[0].speed_mps"),
         ({"pedestrian_speed_mps.low": MISSING}, "pedestrian_speed_mps"),
         # Parts that don't agree with themselves.
@@ -64,11 +66,15 @@ def refusal(data, changes):
         ({"building_rows": [BUILDING_ROW | {"to_m": -9}]}, "building_rows[0]"),
         ({"building_rows": [BUILDING_ROW | {"side": "end"}]}, "building_rows[0]"),
         ({"building_rows": [BUILDING_ROW | {"from_m": -1e10}]}, "building_rows[0].from_m"),
-        # Rows of which nothing would be placed: a house is at least 7 m wide, and the arms take the
-        # ground beside the last 5 m of the stem.
+        # Steps of a twelfth of a second past the 200 m that are seen.
+        ({"vehicle.speed_mps": 1e7}, "vehicle.speed_mps"),
+        ({"pedestrian_speed_mps.high": [2.0, 1e8]}, "pedestrian_speed_mps.high"),
+        # Rows of which nothing would be placed, or too much: the sidewalk is 2 m wide, and a house
+        # at least 7 m; the arms take the ground beside the last 5 m of the stem.
+        ({"building_rows": [BUILDING_ROW | {"setback_m": 1.9}]}, "building_rows[0].setback_m"),
         ({"building_rows": [BUILDING_ROW | {"from_m": 39.0}]}, "building_rows[0]"),
         ({"obstacle_rows": [OBSTACLE_ROW | {"from_m": 39.0, "offset_m": 4.0}]}, "obstacle_rows[0]"),
-        ({"obstacle_rows": [OBSTACLE_ROW | {"every_m": 0.001}]}, "obstacle_rows[0].every_m"),
+        ({"obstacle_rows": [OBSTACLE_ROW | {"every_m": 0.001}]}, "building_rows and obstacle_rows"),
         ({"obstacle_rows": [OBSTACLE_ROW | {"to_m": 0.0}]}, "obstacle_rows[0]"),
         ({"obstacles.0.size_m": [4.0, 1.8, 0.6]}, "obstacles[0]"),
         ({"pedestrian_groups.1.walk.at_m": MISSING}, "pedestrian_groups[1].walk"),

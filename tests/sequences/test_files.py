@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
+import os
 import re
+import signal
 import struct
+import zlib
+from functools import partial
 
 import numpy as np
 import pytest
@@ -114,6 +119,12 @@ def npy_header(shape) -> bytes:
     return file.getvalue()
 
 
+def png_header(width, height) -> bytes:
+    parts = (b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0), b"IDAT", b"IEND")
+    chunks = (struct.pack(">I", len(p) - 4) + p + struct.pack(">I", zlib.crc32(p)) for p in parts)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
+
+
 POSE, PICTURE = "1 0 0 0 0 1 0 0 0 0 1 0", np.zeros((24, 40, 3), np.uint8)
 # Format, file, what it holds, and words of the error beside the file's name.
 MISTAKES = [
@@ -126,6 +137,9 @@ MISTAKES = [
     ("zed", "depth000001.npy", np.zeros((24, 40, 2), np.float32), "[24, 40, 2]"),
     ("zed", "depth000001.npy", b"\x93NUMPY\x01\x00", ".npy"),
     ("zed", "depth000001.npy", npy_header((400_000, 400_000)), ".npy"),  # 596 GiB
+    # Neither is decoded: the first is larger than a frame, the second than Pillow's own limit.
+    ("frames", "rgb/0001.png", png_header(30_000, 5_000), "pixels"),
+    ("frames", "rgb/0001.png", png_header(30_000, 30_000), "pixels"),
     ("frames", "flow/0001.flo", flo(-40, -24, 8 * 40 * 24), "is no .flo"),
     ("frames", "flow/0001.flo", flo(40, -1, 8 * 40 * 24), "is no .flo"),
     ("frames", "flow/0001.flo", flo(0, 24, 0), "is no .flo"),
@@ -169,11 +183,52 @@ def test_a_mistake_ends_in_a_line_that_names_the_file(name, file, content, says,
     assert says in refusal(lambda: open_it(tmp_path), named)
 
 
+def test_a_file_that_is_larger_than_any_table_is_not_read(tmp_path):
+    synthetic.write_frames(tmp_path)
+    with (tmp_path / "poses.txt").open("r+b") as file:
+        file.truncate(2**31)  # takes no room on disk
+    assert "bytes" in refusal(lambda: sequences.open_recording(tmp_path, "frames"), "poses.txt")
+
+
 @pytest.mark.parametrize("content", ["[" * 200_000, '{"a": [1%s]}' % ("0" * 400)])
 def test_json_that_no_number_holds_ends_in_a_line(content, tmp_path):
     synthetic.write_frames(tmp_path)
     put(tmp_path / "k.json", [content])
     refusal(lambda: sequences.open_recording(tmp_path, "frames", intrinsics="k.json:a"), "k.json")
+
+
+def write_video(folder):
+    synthetic.write_frames(folder)
+    put(folder / "video.mp4", b"no video")
+
+
+open_video = partial(sequences.open_recording, format="frames", rgb="video.mp4")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")
+@pytest.mark.parametrize("name", [*FORMATS, "a video"])
+def test_a_pipe_is_refused_and_not_waited_for(name, tmp_path):
+    write, open_it, *_ = (FORMATS | {"a video": (write_video, open_video)})[name]
+    write(tmp_path)
+
+    def too_long(*_):
+        raise TimeoutError("it waits for the pipe")
+
+    previous = signal.signal(signal.SIGALRM, too_long)
+    try:
+        for path in [path for path in tmp_path.rglob("*") if path.is_file()]:
+            content = path.read_bytes()
+            path.unlink()
+            os.mkfifo(path)
+            signal.alarm(20)
+            with contextlib.suppress(sequences.SequenceError):  # what is optional is not there
+                list(open_it(tmp_path))
+            signal.alarm(0)
+            path.unlink()
+            path.write_bytes(content)
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, previous)
 
 
 def test_an_hdf5_file_of_two_arrays_or_none_is_refused(tmp_path):

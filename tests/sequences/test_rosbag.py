@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 
 import numpy as np
@@ -253,3 +254,9 @@ def test_a_bag_that_was_cut_off_is_named(kind, tmp_path):
     file.write_bytes(file.read_bytes()[:5000])
     with pytest.raises(SequenceError, match="in"):
         list(open_recording(path, "rosbag"))
+
+
+def test_a_named_pipe_is_refused_as_a_bag(tmp_path):
+    os.mkfifo(tmp_path / "in.bag")
+    with pytest.raises(SequenceError, match="regular"):
+        open_recording(tmp_path / "in.bag", "rosbag")

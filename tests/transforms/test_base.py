@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pickle
 import re
+import shutil
+import sys
 
 import pytest
 import torch
@@ -37,6 +39,7 @@ def test_compiled_flow_goes_through_torch_compile_and_stays_picklable(monkeypatc
         return COMPILE(function, backend="eager", **options)
 
     monkeypatch.setattr(torch, "compile", spy)
+    monkeypatch.setattr(shutil, "which", lambda name: name)
     T.base._compiled.cache_clear()
     td = moments(2)
     transform = T.RawFlow(INTRINSICS, compiled=True)
@@ -45,6 +48,14 @@ def test_compiled_flow_goes_through_torch_compile_and_stays_picklable(monkeypatc
     assert torch.equal(fused, T.RawFlow(INTRINSICS)(td.clone())["raw"])
     assert torch.equal(fused, pickle.loads(pickle.dumps(transform))(td.clone())["raw"])
     T.base._compiled.cache_clear()
+
+
+def test_without_a_compiler_compiled_flow_is_refused(monkeypatch):
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    monkeypatch.setenv("CXX", "clang++-19")
+    with pytest.raises(ValueError, match=r"C\+\+.*clang\+\+-19"):
+        T.RawFlow(INTRINSICS, compiled=True)
 
 
 def test_missing_key_is_named_with_what_the_env_offers_before_the_first_step():
@@ -141,6 +152,13 @@ def test_mistakes_in_a_subclass_of_map_transform_are_named():
         Bare()(moments(2))
 
 
+class OwnSkip(Transform):
+    """Steps the env twice, as whoever writes a frame skip for themselves does."""
+
+    def _step(self, tensordict, next_tensordict):
+        return self.parent.step(tensordict)["next"]
+
+
 def noop() -> Transform:
     return NoopResetEnv(1, random=False)
 
@@ -157,7 +175,7 @@ def by_poses() -> list[Transform]:
     ]
 
 
-@pytest.mark.parametrize("make", [lambda: FrameSkipTransform(2), noop])
+@pytest.mark.parametrize("make", [lambda: FrameSkipTransform(2), noop, OwnSkip])
 @pytest.mark.parametrize("is_first", [True, False])
 def test_the_motion_of_the_envs_last_step_is_refused_where_others_step_it(make, is_first):
     parts = [make(), *by_motions()] if is_first else [*by_motions(), make()]

@@ -86,6 +86,25 @@ def rows_of(ids, body_ids, **options):
     return transform(td)["sensor", "instance"].flatten().tolist()
 
 
+# PyBullet's ids with links: body + (link + 1) * 2^24. Body 3's base, its links 0 and 2, body 5's
+# base and link 0, the floor 0 and the background.
+LINKS = [3, 3 + 2**24, 3 + 3 * 2**24, 5, 5 + 2**24, 0, -1]
+
+
+def test_pybullets_links_take_the_rows_of_their_bodies_or_their_own():
+    assert rows_of(LINKS, [5, 3], links_as_body=True) == [2, 2, 2, 1, 1, 0, 0]
+    each = [(3, 2), (5, -1), (3, -1), (3, 0), (5, 0)]
+    assert rows_of(LINKS, each) == [3, 4, 1, 2, 5, 0, 0]
+    # link 2 has a row of its own, the others move as their bodies
+    assert rows_of(LINKS, [3, (3, 2), 5], links_as_body=True) == [1, 1, 2, 3, 3, 0, 0]
+
+
+@pytest.mark.parametrize("seen", [LINKS, [3, 0, 5 + 2**24]])
+def test_links_of_a_body_that_is_named_without_them_are_refused(seen):
+    with pytest.raises(ValueError, match=r"body \d, link 0.*links_as_body=True"):
+        rows_of(seen, [5, 3])
+
+
 def test_ids_without_a_row_are_named_once_with_their_share():
     transform = InstanceIds([17], in_keys=("sensor", "semantic"))
     td = TensorDict({"sensor": {"semantic": torch.tensor([[[17, 4, 4, 9, -1, 0, 17, 17]]])}})
@@ -94,13 +113,41 @@ def test_ids_without_a_row_are_named_once_with_their_share():
     assert len(told) == 1
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        transform(td.clone())
+        for _ in range(250):
+            transform(td.clone())
         rows_of([17, 4, 9, -1, 0], [17], static_ids=[0, 4, 9])
     other = td.clone()
     other["sensor", "semantic"][0, 0, 0] = 5  # a body that has come later
     with pytest.warns(UserWarning, match=r"\b5 \(12.5%\)") as told:
-        transform(other.clone())
+        [transform(other.clone()) for _ in range(100)]
     assert len(told) == 1
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        transform._step(td, td.clone().apply(lambda ids: ids + 100))  # steps don't search
+
+
+def test_pybullets_own_picture_of_links():
+    bullet = pytest.importorskip("pybullet")
+    client = bullet.connect(bullet.DIRECT)
+    try:
+        shape = bullet.createVisualShape(
+            bullet.GEOM_BOX, halfExtents=[0.1, 0.4, 0.4], physicsClientId=client
+        )
+        body = bullet.createMultiBody(  # the base on the left, its link on the right
+            *(1, -1, shape, [2, 0.5, 0]),
+            linkMasses=[1], linkCollisionShapeIndices=[-1], linkVisualShapeIndices=[shape],
+            linkPositions=[[0, -1, 0]], linkOrientations=[[0, 0, 0, 1]],
+            linkInertialFramePositions=[[0, 0, 0]], linkInertialFrameOrientations=[[0, 0, 0, 1]],
+            linkParentIndices=[0], linkJointTypes=[bullet.JOINT_FIXED], linkJointAxis=[[0, 0, 1]],
+            physicsClientId=client,
+        )  # fmt: skip
+        view = bullet.computeViewMatrix([0, 0, 0], [1, 0, 0], [0, 0, 1])
+        lens = bullet.computeProjectionMatrixFOV(60, 2.0, 0.1, 10.0)
+        flag = bullet.ER_SEGMENTATION_MASK_OBJECT_AND_LINKINDEX
+        ids = bullet.getCameraImage(
+            16, 8, view, lens, flags=flag, renderer=bullet.ER_TINY_RENDERER, physicsClientId=client
+        )[4]
+    finally:
+        bullet.disconnect(client)
+    middle = torch.as_tensor(ids).reshape(8, 16)[4]
+    rows = torch.tensor(rows_of(middle.tolist(), [(body, 0), (body, -1)]))
+    assert (rows[:8] != 1).all()
+    assert (rows[8:] != 2).all()
+    assert set(rows.tolist()) == {0, 1, 2}

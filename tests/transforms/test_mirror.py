@@ -123,6 +123,17 @@ def test_one_hot_actions_and_actions_of_their_own_dim_are_exchanged():
     assert mirror()(column)["action"].tolist() == [[0], [2], [1]]
 
 
+def test_masks_of_actions_are_exchanged_with_them():
+    td = transitions(1)
+    td["action"] = torch.tensor([1])
+    td["action_mask"] = torch.tensor([[True, True, False]])
+    td["next", "action_mask"] = torch.tensor([[False, False, True]])
+    image = mirror()(td)
+    assert image["action_mask"].tolist() == [[True, False, True]]
+    assert image["next", "action_mask"].tolist() == [[False, True, False]]
+    assert image["action"].tolist() == [2]
+
+
 def test_continuous_actions_are_refused():
     td = transitions(2)
     td["action"] = torch.tensor([[0.7], [-0.4]])

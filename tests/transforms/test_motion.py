@@ -14,11 +14,12 @@ from flowrep.transforms import (
     CameraMotion,
     EstimateCameraMotion,
     FlowFactorize,
+    InstanceIds,
     InstanceMotion,
     RawFlow,
 )
 from flowrep.transforms.base import IDS, RecurrentTransform
-from tests.transforms.fake_env import INTRINSICS, FakeSensorEnv, frame_motions
+from tests.transforms.fake_env import INTRINSICS, FakeSensorEnv, frame_motions, moments
 
 MOTION = "motion"
 
@@ -115,6 +116,16 @@ def test_no_body_gets_its_neighbours_motion():
     for ids in (Unbounded(shape, dtype=torch.uint8), Bounded(0, 255, shape, dtype=torch.uint8)):
         with pytest.raises(ValueError, match=r"any id.*InstanceIds"):
             flow(ids=ids)
+
+
+def test_bodies_of_a_batch_are_counted_if_instance_ids_is_beside_the_flow():
+    def flow(*bodies):
+        td, ids = moments(2), InstanceIds(bodies, static_ids=[0, 2], in_keys="ids")
+        return Compose(ids, RawFlow(INTRINSICS))(td.set("ids", td["sensor", "instance"]))["raw"]
+
+    assert flow(1, 2).any()
+    with pytest.raises(ValueError, match=r"ids from 0 to 1.*3 rows.*1 \+ N"):
+        flow(1)
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
