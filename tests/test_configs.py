@@ -56,6 +56,7 @@ def test_a_preset_asks_of_one_algorithm_what_others_do_not_have():
         return plain("train", *line)["algorithm"]
 
     assert algorithm("preset=laptop")["n_steps"] == 10
+    assert algorithm("preset=long") == algorithm("preset=laptop")
     assert algorithm("preset=paper")["n_steps"] == 1
     assert "n_steps" not in algorithm("preset=laptop", "algorithm=ppo")
     # the command line has the last word
