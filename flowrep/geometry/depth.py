@@ -16,6 +16,11 @@ from flowrep.geometry.checks import check_name, check_shape, common_batch
 
 DepthKind: TypeAlias = Literal["z", "ray_length", "disparity", "z_buffer", "reversed_z_buffer"]
 
+# Which of the arguments that are needed by some kinds alone.
+_READ_BY: dict[str, list[str]] = {
+    "z": [], "ray_length": ["K"], "disparity": ["K", "baseline_m"],
+    "z_buffer": ["near_m", "far_m"], "reversed_z_buffer": ["near_m", "far_m"],
+}  # fmt: skip
 # How far a depth buffer may be from 1 where nothing is drawn. The float32 products in PyBullet's
 # software renderer are off by up to three times the spacing of numbers below 1.
 _ROUNDING = 3 * 2.0**-24
@@ -69,23 +74,16 @@ def adapt_depth(
     tensor([[[0.5000,    inf]]])
     """
     check_name("kind", kind, DepthKind)
-    if (K is not None) != (kind in ("ray_length", "disparity")):
+    given = {"K": K, "baseline_m": baseline_m, "near_m": near_m, "far_m": far_m}
+    named = [name for name, value in given.items() if value is not None]
+    if named != _READ_BY[kind]:
         raise ValueError(
-            "'ray_length' and 'disparity' need K (AdaptDepth: intrinsics=), the other kinds do not "
-            f"read it; kind is {kind!r}"
+            f"depth of kind {kind!r} needs {_READ_BY[kind] or 'none'} of {[*given]}, got {named}; "
+            "K is AdaptDepth's intrinsics"
         )
-    if (baseline_m is not None) != (kind == "disparity") or not (baseline_m or 1.0) > 0:
-        raise ValueError(
-            "'disparity' needs baseline_m, a positive number of metres, the other kinds do not "
-            f"read it; kind is {kind!r}, baseline_m={baseline_m}"
-        )
+    if baseline_m is not None and not baseline_m > 0:
+        raise ValueError(f"baseline_m must be a positive number of metres, got {baseline_m}")
     is_buffer = kind.endswith("z_buffer")
-    planes = (near_m is not None) + (far_m is not None)
-    if planes != (2 if is_buffer else 0):
-        raise ValueError(
-            "'z_buffer' and 'reversed_z_buffer' need near_m and far_m, the other kinds do not "
-            f"read them; kind is {kind!r}, near_m={near_m}, far_m={far_m}"
-        )
     if scale_m is not None and (is_buffer or not 0 < scale_m < math.inf):
         raise ValueError(
             f"scale_m is metres per unit, positive, and a z-buffer has none; kind is {kind!r}, "

@@ -32,7 +32,7 @@ MISTAKES = {
     r"num_classes.* 2\.5": lambda: T.Segmentation(2.5),
     r"range_m must be a positive": lambda: T.Depth(range_m=math.inf),
     r"missing must be in \[0, 1\]": lambda: T.Depth(missing=1.5),
-    r"need K": lambda: T.AdaptDepth("ray_length"),
+    r"needs \['K'\].* intrinsics": lambda: T.AdaptDepth("ray_length"),
     r"reads and writes depth: a second pass": lambda: T.AdaptDepth("z", out_keys="depth"),
     r"'unity'\], got 'gl'": lambda: T.AdaptPose(axes="gl"),
     r"swap the two pictures": lambda: T.AdaptFlow(direction="forward", grid="previous"),
