@@ -21,7 +21,7 @@ from torchrl.trainers import ReplayBufferTrainer, TargetNetUpdaterHook, Trainer
 
 from flowrep.agent import DiscreteSAC, ReplayMemory
 from flowrep.agent.dsac import DiscreteSACMapLoss
-from flowrep.agent.networks import DiscreteActions
+from flowrep.agent.networks import action_count
 from flowrep.config.algorithms import DiscreteSACOptions
 from flowrep.envs import get_states, make_env, set_states
 from flowrep.scenes import load_scene
@@ -64,7 +64,7 @@ def make_trainer(
     options = DiscreteSACOptions(initial_alpha=0.05, gamma=GAMMA)
     policy = DiscreteSAC.make_policy(spec, action_spec, MAPS, options, total_frames=frames)
     network = policy[0].module.network
-    loss = DiscreteSACMapLoss(network, DiscreteActions.from_spec(action_spec), options)
+    loss = DiscreteSACMapLoss(network, action_count(action_spec), options)
     memory = ReplayMemory(
         network.codecs, capacity=capacity, batch_size=batch_size, device="cpu", n_steps=N_STEPS,
         gamma=GAMMA,

@@ -18,12 +18,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 from flowrep.agent.cuda_graph import as_cuda_graph
 from flowrep.agent.divergence import DivergenceWatch
-from flowrep.agent.networks import (
-    DiscreteActions,
-    MapNetwork,
-    PolicyNetwork,
-    stochastic_policy,
-)
+from flowrep.agent.networks import MapNetwork, PolicyNetwork, action_count, stochastic_policy
 from flowrep.agent.observation import MapCodec, compute_dtype, map_codecs
 from flowrep.agent.replay import OUTCOME, ReplayMemory
 from flowrep.config.algorithms import AlgorithmOptions, OffPolicyOptions
@@ -61,7 +56,7 @@ class Algorithm(ABC):
     is minimised."""
 
     LOSS: ClassVar[Callable[..., LossModule]]
-    """Builds the loss from the policy's `MapNetwork`, `DiscreteActions` and the options."""
+    """Builds the loss from the policy's `MapNetwork`, the number of actions and the options."""
 
     CAPTURABLE: ClassVar[bool] = True
     """Whether `losses` and `after_update` can be part of a CUDA graph, see `as_cuda_graph`."""
@@ -137,12 +132,12 @@ class Algorithm(ABC):
         """
         device = torch.device(device)
         codecs = map_codecs(observation_spec, keys, compute_dtype(options.precision, device))
-        actions = DiscreteActions.from_spec(action_spec)
+        count = action_count(action_spec)
         layer_norm = getattr(options, "layer_norm", False)  # not an option of every algorithm
         with device:
-            network = MapNetwork(codecs, options.hidden_size, actions.count, layer_norm=layer_norm)
+            network = MapNetwork(codecs, options.hidden_size, count, layer_norm=layer_norm)
         return stochastic_policy(
-            PolicyNetwork(network), list(keys), actions, writes_log_prob=cls.WRITES_LOG_PROB
+            PolicyNetwork(network), list(keys), writes_log_prob=cls.WRITES_LOG_PROB
         )
 
     def step_eagerly(self) -> None:
@@ -271,7 +266,7 @@ class OffPolicy(Algorithm):
 
     Args:
         observation_spec: the last three dims of each map are C, H, W.
-        action_spec: `Categorical` or `OneHot`.
+        action_spec: a `Categorical`.
         keys: the observation maps to read, in order.
         options: an instance of the class's `OPTIONS`.
         total_frames: frames of the whole training, at whose end the learning rate is 0.
@@ -301,7 +296,7 @@ class OffPolicy(Algorithm):
         )
         network = self.policy[0].module.network
         self.codecs = network.codecs
-        loss = self.LOSS(network, DiscreteActions.from_spec(action_spec), options)
+        loss = self.LOSS(network, action_count(action_spec), options)
         starts = options.learning_starts
         self.learning_starts = options.batch_size if starts is None else starts
         super().__init__(

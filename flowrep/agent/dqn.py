@@ -10,13 +10,13 @@ import torch.nn.functional as F
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor
-from torch.distributions import Distribution
+from torch.distributions import Categorical, Distribution
 from torchrl.data import Composite, TensorSpec
 from torchrl.modules import EGreedyModule, QValueModule
 from torchrl.objectives import DQNLoss, ValueEstimators
 
 from flowrep.agent.algorithm import OffPolicy
-from flowrep.agent.networks import DiscreteActions, MapNetwork, PolicyNetwork
+from flowrep.agent.networks import MapNetwork, PolicyNetwork, action_count
 from flowrep.config.algorithms import DoubleDQNOptions
 
 
@@ -27,15 +27,13 @@ class EpsilonGreedyPolicy(TensorDictSequential):
         self,
         network: PolicyNetwork,
         keys: Sequence[NestedKey],
-        actions: DiscreteActions,
         exploration: EGreedyModule,
     ) -> None:
         super().__init__(
             TensorDictModule(network, keys, ["action_value"]),
-            QValueModule(action_space=actions.space),
+            QValueModule(action_space="categorical"),
             exploration,
         )
-        self.distribution_class: Any = actions.distribution
         self.select_out_keys("action")
 
     def get_dist(self, tensordict: TensorDictBase) -> Distribution:
@@ -43,23 +41,21 @@ class EpsilonGreedyPolicy(TensorDictSequential):
         values = self[0](tensordict.copy())["action_value"]
         best = F.one_hot(values.argmax(-1), values.shape[-1])
         epsilon = self[2].eps
-        return self.distribution_class(probs=epsilon / values.shape[-1] + (1 - epsilon) * best)
+        return Categorical(probs=epsilon / values.shape[-1] + (1 - epsilon) * best)
 
 
 class DoubleDQNMapLoss(DQNLoss):
     """TorchRL's double Q-learning loss on stored maps, with a target; see `DoubleDQN`."""
 
-    def __init__(
-        self, network: MapNetwork, actions: DiscreteActions, options: DoubleDQNOptions
-    ) -> None:
+    def __init__(self, network: MapNetwork, num_actions: int, options: DoubleDQNOptions) -> None:
         keys = [codec.key for codec in network.codecs]
         learning = TensorDictModule(PolicyNetwork(network), keys, ["action_value"])
         super().__init__(
-            TensorDictSequential(learning, QValueModule(action_space=actions.space)),
+            TensorDictSequential(learning, QValueModule(action_space="categorical")),
             loss_function="l2",
             delay_value=True,
             double_dqn=True,
-            action_space=actions.space,
+            action_space="categorical",
         )
         self.make_value_estimator(ValueEstimators.TD0, gamma=options.gamma)
 
@@ -102,16 +98,15 @@ class DoubleDQN(OffPolicy):
         """See `Algorithm.make_policy`; the policy's state includes ε."""
         run: Any = {"total_frames": total_frames, "device": device}
         stochastic = super().make_policy(observation_spec, action_spec, keys, options, **run)
-        actions = DiscreteActions.from_spec(action_spec)
         exploration = EGreedyModule(
             # Without the batch of envs, so that any batch may act.
-            type(action_spec)(actions.count, dtype=action_spec.dtype, device=device),
+            type(action_spec)(action_count(action_spec), dtype=action_spec.dtype, device=device),
             options.initial_epsilon,
             options.final_epsilon,
             max(1, int(options.exploration_share * total_frames)),
             device=device,
         )
-        return EpsilonGreedyPolicy(stochastic[0].module, list(keys), actions, exploration)
+        return EpsilonGreedyPolicy(stochastic[0].module, list(keys), exploration)
 
     def remember(self, steps: TensorDictBase) -> None:
         """Stores steps and lowers ε for each of them."""

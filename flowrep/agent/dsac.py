@@ -13,7 +13,7 @@ from torchrl.objectives import DiscreteSACLoss, LossModule
 
 from flowrep.agent import networks
 from flowrep.agent.algorithm import OffPolicy, td_target, transition_keys
-from flowrep.agent.networks import DiscreteActions, Encoder, Head, MapNetwork
+from flowrep.agent.networks import Encoder, Head, MapNetwork
 from flowrep.agent.observation import decode_maps
 from flowrep.config.algorithms import AlgorithmOptions, DiscreteSACOptions, SoftActorCriticOptions
 
@@ -43,7 +43,7 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
     def __init__(
         self,
         actor: MapNetwork,
-        actions: DiscreteActions,
+        num_actions: int,
         options: DiscreteSACOptions,
     ) -> None:
         shared = options.encoder == "shared"
@@ -51,18 +51,18 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
             critic_encoder = actor.encoder
             if not shared:
                 critic_encoder = Encoder(actor.codecs, layer_norm=actor.encoder.layer_norm)
-            critic_head = Head(critic_encoder.embedding_size, actor.hidden_size, actions.count)
+            critic_head = Head(critic_encoder.embedding_size, actor.hidden_size, num_actions)
         super().__init__(
-            networks.stochastic_policy(actor.head, ["actor_embedding"], actions),
+            networks.stochastic_policy(actor.head, ["actor_embedding"]),
             TensorDictModule(critic_head, ["critic_embedding"], ["action_value"]),
-            action_space=actions.space,
-            num_actions=actions.count,
+            action_space="categorical",
+            num_actions=num_actions,
             loss_function="l2",
             alpha_init=options.initial_alpha,
             target_entropy="auto",
             target_entropy_weight=options.target_entropy_weight,
         )
-        self.codecs, self.actions, self.gamma = actor.codecs, actions, options.gamma
+        self.codecs, self.gamma = actor.codecs, options.gamma
         self.encoder_is_shared = shared
         self.convert_to_functional(critic_encoder, "critic_encoder", create_target_params=True)
         if not shared:
@@ -84,8 +84,7 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
         policy = log_policy.exp()
         negative_entropy = (policy * log_policy).sum(-1)
         q = networks.heads_together(embedding, self.qvalue_network_params["module"])  # [2, N, n]
-        action = self.actions.numbers(tensordict["action"])
-        chosen = q.gather(-1, action.expand(2, -1).unsqueeze(-1)).squeeze(-1)
+        chosen = q.gather(-1, tensordict["action"].expand(2, -1).unsqueeze(-1)).squeeze(-1)
         td_error = chosen - target
         # The smaller Q, because a policy that maximises a single Q exploits its errors.
         expected_q = (policy * q.detach().amin(0)).sum(-1)

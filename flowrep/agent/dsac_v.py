@@ -13,7 +13,7 @@ from torchrl.objectives import LossModule
 
 from flowrep.agent.algorithm import td_target, transition_keys
 from flowrep.agent.dsac import DiscreteSAC
-from flowrep.agent.networks import DiscreteActions, MapNetwork
+from flowrep.agent.networks import MapNetwork
 from flowrep.agent.observation import decode_maps
 from flowrep.config.algorithms import DiscreteSACWithValueOptions
 
@@ -47,26 +47,26 @@ class DiscreteSACValueLoss(LossModule):
     def __init__(
         self,
         actor: MapNetwork,
-        actions: DiscreteActions,
+        num_actions: int,
         options: DiscreteSACWithValueOptions,
     ) -> None:
         super().__init__()
         with next(actor.parameters()).device:
-            q1, q2 = (actor.another(actions.count) for _ in range(2))
+            q1, q2 = (actor.another(num_actions) for _ in range(2))
             value = actor.another(1)
             log_alpha = torch.nn.Parameter(torch.tensor(math.log(options.initial_alpha)))
         for name, network in {"actor": actor, "q1": q1, "q2": q2}.items():
             self.convert_to_functional(network, name)
         self.convert_to_functional(value, "value", create_target_params=True)
         self.log_alpha = log_alpha
-        self.codecs, self.actions, self.gamma = actor.codecs, actions, options.gamma
-        self.target_entropy = options.target_entropy_weight * math.log(actions.count)
+        self.codecs, self.gamma = actor.codecs, options.gamma
+        self.target_entropy = options.target_entropy_weight * math.log(num_actions)
         self.in_keys = transition_keys(self.codecs)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns the losses of a batch, with gradients, and further metrics, without."""
         images = decode_maps(self.codecs, tensordict)
-        action = self.actions.numbers(tensordict["action"])
+        action = tensordict["action"]
         alpha = self.log_alpha.detach().exp()
 
         log_policy = self.actor(images).log_softmax(-1)

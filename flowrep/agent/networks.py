@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -21,34 +20,21 @@ from tensordict.nn import (
     TensorDictModule,
 )
 from torch import Tensor, nn
-from torchrl.data import Categorical, OneHot, TensorSpec
-from torchrl.modules import OneHotCategorical
+from torchrl.data import Categorical, TensorSpec
 
 from flowrep.agent.observation import MapCodec
 
 EMBEDDING_SIZE = 512
 
 
-@dataclass(frozen=True)
-class DiscreteActions:
-    """The number of actions, TorchRL's name for their encoding and the matching distribution."""
-
-    count: int
-    space: str
-    distribution: type[torch.distributions.Distribution]
-
-    @classmethod
-    def from_spec(cls, spec: TensorSpec) -> DiscreteActions:
-        """Reads a `Categorical` or `OneHot` spec."""
-        if type(spec) is Categorical:  # its subclasses encode several choices at once
-            return cls(int(spec.space.n), "categorical", torch.distributions.Categorical)
-        if type(spec) is OneHot:
-            return cls(int(spec.space.n), "one-hot", OneHotCategorical)
-        raise TypeError(f"expected a Categorical or OneHot action spec, got {type(spec).__name__}")
-
-    def numbers(self, action: Tensor) -> Tensor:
-        """Returns actions `[N]` or `[N, count]`, as the spec encodes them, as numbers `[N]`."""
-        return action if self.space == "categorical" else action.to(torch.uint8).argmax(-1)
+def action_count(spec: TensorSpec) -> int:
+    """Returns the number of actions of a `Categorical` spec; TypeError for another."""
+    if type(spec) is not Categorical:  # its subclasses encode several choices at once
+        raise TypeError(
+            f"expected a Categorical action spec, got {type(spec).__name__}; TorchRL's wrappers "
+            "have one with categorical_action_encoding=True"
+        )
+    return int(spec.space.n)
 
 
 def _autocast_like(x: Tensor) -> AbstractContextManager[Any]:
@@ -189,7 +175,6 @@ class PolicyNetwork(nn.Module):
 def stochastic_policy(
     network: nn.Module,
     in_keys: Sequence[NestedKey],
-    actions: DiscreteActions,
     *,
     writes_log_prob: bool = False,
 ) -> ProbabilisticTensorDictSequential:
@@ -201,7 +186,7 @@ def stochastic_policy(
     draw = ProbabilisticTensorDictModule(
         in_keys=["logits"],
         out_keys=["action"],
-        distribution_class=actions.distribution,
+        distribution_class=torch.distributions.Categorical,
         distribution_kwargs={"validate_args": False},
         default_interaction_type=InteractionType.RANDOM,
         return_log_prob=writes_log_prob,

@@ -15,7 +15,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from flowrep.agent.algorithm import Algorithm
-from flowrep.agent.networks import DiscreteActions, Encoder, Head, MapNetwork, stochastic_policy
+from flowrep.agent.networks import Encoder, Head, MapNetwork, action_count, stochastic_policy
 from flowrep.agent.observation import MapCodec, decode_maps, store_maps
 from flowrep.agent.replay import OUTCOME, time_first
 from flowrep.config.algorithms import PPOOptions
@@ -74,11 +74,11 @@ class ClipPPOMapLoss(ClipPPOLoss):
     encoder_params: TensorDictParams
     target_encoder_params: TensorDictParams
 
-    def __init__(self, network: MapNetwork, actions: DiscreteActions, options: PPOOptions) -> None:
+    def __init__(self, network: MapNetwork, num_actions: int, options: PPOOptions) -> None:
         with next(network.parameters()).device:
             critic = Head(network.encoder.embedding_size, network.hidden_size, 1)
         super().__init__(
-            stochastic_policy(network.head, ["embedding"], actions),
+            stochastic_policy(network.head, ["embedding"]),
             TensorDictModule(critic, ["embedding"], ["state_value"]),
             clip_epsilon=options.clip,
             entropy_coeff=options.entropy_weight,
@@ -152,7 +152,7 @@ class PPO(Algorithm):
         self.policy = self.make_policy(
             observation_spec, action_spec, keys, options, total_frames=total_frames, device=device
         )
-        network, actions = self.policy[0].module.network, DiscreteActions.from_spec(action_spec)
+        network = self.policy[0].module.network
         discounts = {"gamma": options.gamma, "lmbda": options.gae_lambda}
         self._advantage = GAE(**discounts, value_network=None, device=device)
         self.codecs = network.codecs
@@ -160,7 +160,7 @@ class PPO(Algorithm):
         self._round: TensorDictBase = TensorDict()  # the steps in training, [n]
         self._batches: list[Tensor] = []  # rows of the round's remaining batches
         super().__init__(
-            self.LOSS(network, actions, options),
+            self.LOSS(network, action_count(action_spec), options),
             learning_rate=options.learning_rate,
             total_updates=rounds * self._updates_of(options.rollout_length),
             max_grad_norm=options.max_grad_norm,

@@ -6,9 +6,8 @@ from functools import partial
 
 import pytest
 import torch
-import torch.nn.functional as F
 from tensordict import TensorDict
-from torchrl.data import Categorical, OneHot
+from torchrl.data import Categorical
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from flowrep.agent import cpu, load_checkpoint, save_checkpoint, torch_threads
@@ -133,21 +132,6 @@ def test_an_agent_that_diverged_keeps_its_weights_until_a_state_is_loaded(make_a
     for batch in batches:
         new.update(batch.clone())
     assert [name for name, w in weights(new).items() if not torch.equal(w, after[name])] == []
-
-
-@pytest.mark.slow_after_first
-def test_one_hot_actions_train_the_same_weights_as_categorical_ones(make_any, random_steps):
-    agents = plain, one_hot = make_any(), make_any(action_spec=OneHot(3))
-    for _ in range(8):
-        steps = random_steps(ENVS)
-        plain.remember(steps)
-        one_hot.remember(steps.copy().set("action", F.one_hot(steps["action"], 3)))
-    for agent in agents:
-        torch.manual_seed(1)
-        for _ in range(3):
-            agent.update(agent.sample())
-    for name, weight in plain.weights.items():
-        torch.testing.assert_close(one_hot.weights[name], weight)
 
 
 def test_a_state_of_other_maps_is_refused_with_a_weight_that_differs(make_agent):

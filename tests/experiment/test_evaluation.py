@@ -10,14 +10,13 @@ from torch import nn
 
 pytest.importorskip("pybullet", reason="policies drive the simulated street")
 
-from flowrep.agent.networks import DiscreteActions, stochastic_policy
+from flowrep.agent.networks import stochastic_policy
 from flowrep.envs import make_env
 from flowrep.experiment.evaluation import PairedEvaluation, evaluate, scene_id
 from flowrep.scenes import load_scene
 
 NO_OP = 0
 NOISE = {"depth_sigma_per_m": 0.01, "depth_dropout": 0.1, "drift_m": 0.05, "drift_rad": 0.01}
-ACTIONS = DiscreteActions(3, "categorical", torch.distributions.Categorical)
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +39,7 @@ class Weigher(nn.Module):
 
 
 def weigher(*names):
-    return stochastic_policy(Weigher(), list(names), ACTIONS)
+    return stochastic_policy(Weigher(), list(names))
 
 
 def straight_on(tensordict):
