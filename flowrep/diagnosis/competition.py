@@ -13,7 +13,7 @@ from flowrep.diagnosis import explanation, fit, pictures, poses
 from flowrep.diagnosis.candidates import Candidate, candidate
 from flowrep.diagnosis.explanation import Explanation
 from flowrep.diagnosis.fit import EYE, Pairs, flow_of, length, median, residuals
-from flowrep.diagnosis.limits import SURE
+from flowrep.diagnosis.limits import REST_PX, SURE
 from flowrep.diagnosis.pictures import Metric, Mixture, Noise
 from flowrep.diagnosis.rivals import FAR, NO_RIVAL, OF_NOISE, STILL, Rival
 from flowrep.geometry.egomotion import motion_of_points
@@ -33,6 +33,7 @@ class Competition:
         still: that the camera stands still.
         noise: that of all explanations.
         flow_px: the median length of flow.
+        ego_px: that of ego flow as recorded.
         rule_px: the errors of poses that a rule predicts, see `poses.by_a_rule`.
         rule_nats: what speaks for the rule.
     """
@@ -44,6 +45,7 @@ class Competition:
         self.rivals = [r for r in rivals if pairs.has_poses or r.subject != "poses"]
         starts, shown, noise = _first_look(pairs, self.rivals)
         likely = pictures.best_of(shown)
+        self.ego_px = median(fit.middle(flow_of(pairs, pairs.motion))) if pairs.has_poses else 0.0
         self.flow_px = median(fit.middle(pairs.raw if pairs.by_flow else flow_of(pairs, likely)))
         pairs = pairs._replace(smooth=_smooth(pairs, shown))
         own = torch.where(pairs.motion.isfinite(), pairs.motion, EYE) if pairs.has_poses else likely
@@ -87,8 +89,14 @@ class Competition:
         return self.is_seen(other) and (null is None or other.nats - null.nats > SURE)
 
     def is_seen(self, other: Explanation) -> bool:
-        """Whether data show what it needs: raw flow beyond noise, or else a camera that moves."""
-        null = self.of_noise if other.rival.subject == "flow" else self.still
+        """Whether data show what it needs: raw flow beyond noise, or else a camera that moves.
+
+        Beside a camera at rest, flow shows bodies and noise, whatever its conventions.
+        """
+        of_flow = other.rival.subject == "flow"
+        if of_flow and self._has_poses and self.ego_px <= REST_PX:
+            return False
+        null = self.of_noise if of_flow else self.still
         return null is None or other.nats - null.nats > SURE
 
     def _explained(self, by: Candidate, motions: Tensor) -> Explanation:
