@@ -5,10 +5,8 @@ What needs PyTorch, which takes seconds to import, is imported when the config h
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -97,10 +95,11 @@ def view(config: ViewConfig, agent: Agent, film: Film) -> None:
     # Closed exits belong to a path; they are drawn if all episodes took the same one.
     path = episode.path if all(each.path == episode.path for each in episodes) else None
     origin = agent.origin("view") | {"policy": config.policy}
-    rows = [replace(each, **origin).row() for each in episodes]
+    table = [replace(each, **origin).row() for each in episodes]
     folder.mkdir(parents=True, exist_ok=True)
-    chosen = moments([moving_pixels(frame.maps) for frame in frames], config.sheet_rows)
-    write_png(folder / "sheet.png", contact_sheet(film.draw(frames[i]) for i in chosen))
+    rows = config.sheet_rows
+    moments = [frames[len(frames) * (2 * i + 1) // (2 * rows)] for i in range(rows)]
+    write_png(folder / "sheet.png", contact_sheet(map(film.draw, moments)))
     if config.video:
         pictures = progress_bar(film.pictures(frames, episode), desc="drawing", unit="frame")
         write_video(folder / "episode.mp4", pictures, fps=episode.fps)
@@ -108,9 +107,9 @@ def view(config: ViewConfig, agent: Agent, film: Film) -> None:
         (folder / "episode.mp4").unlink(missing_ok=True)
     with replace_file(folder / "plan.png") as partial:
         draw_plan(Layout(scene), tracks, path=path).savefig(partial, dpi=110)
-    write_rows(folder / "episodes.csv", rows)
+    write_rows(folder / "episodes.csv", table)
     shown = ("path", "episode_seed", "outcome", "hit", "return", "length")
-    print_table("episodes", [{name: row[name] for name in shown} for row in rows])
+    print_table("episodes", [{name: row[name] for name in shown} for row in table])
     arrived = sum(each.outcome == "success" for each in episodes)
     print(f"{config.policy}: {arrived} of {len(episodes)} episodes end in success")
     print(f"{folder}: {', '.join(each for each in FILES if (folder / each).is_file())}")
@@ -129,21 +128,6 @@ def drive_on(
         counted = progress_bar(ended, desc="driving on", unit="episode", total=len(options))
         episodes = list(counted)
     return sorted(episodes, key=lambda episode: episode.episode_seed)
-
-
-def moving_pixels(maps: Mapping[str, Any]) -> int:
-    """Returns how many pixels show a moving object more than 4 m from the camera."""
-    return int(((maps["obj"] != 0).any(0) & (maps["depth"][0] > 4.0)).sum())
-
-
-def moments(motion: list[int], count: int) -> list[int]:
-    """Returns frame indices for a contact sheet: the one with most motion in each of `count` parts.
-
-    >>> moments([0, 0, 3, 1, 0, 0, 0, 2], 2)
-    [2, 7]
-    """
-    ends = [round(i * len(motion) / count) for i in range(count + 1)]
-    return [max(range(a, b), key=lambda i: motion[i]) for a, b in pairwise(ends) if b > a]
 
 
 def main() -> None:
