@@ -87,8 +87,6 @@ def assemble(runs: Sequence[Run], warnings: Sequence[str], policy: str = "greedy
         prefix = f"{number}_" if len(groups) > 1 else ""
         for section in _group_sections(group, policy):
             sections.append(section._replace(folder=prefix + section.name, label=group.label))
-    if len(groups) > 1:
-        sections.append(_configs_section(groups)._replace(folder="configs"))
     return Report(tuple(runs), (*warnings, *unused), tuple(sections))
 
 
@@ -333,13 +331,3 @@ def _curves(runs: Sequence[Run]) -> list[ReportSection]:
         "over seeds. Thin lines: training episodes of each seed, with sampled actions."
     )
     return [ReportSection("learning_curves", "Learning curves", (), draw_curves(panels), caption)]
-
-
-def _configs_section(groups: Sequence[Group]) -> ReportSection:
-    keys = dict.fromkeys(key for group in groups for key in group.differences)
-    rows = [(key, *(group.differences.get(key, "")[:60] for group in groups)) for key in keys]
-    configs = [f"config {number}" for number in range(1, len(groups) + 1)]
-    caption = "Config keys in which the runs differ. No number combines runs of two columns."
-    columns = tuple(range(1, len(groups) + 1))
-    table = Table("configs", caption, ("key", *configs), (("", tuple(rows)),), columns)
-    return ReportSection("configs", "Configs that differ", (table,))
