@@ -99,7 +99,7 @@ def check_reader_options(reader: type, options: Mapping[str, Any]) -> None:
     # Not ???, which would not replace the value of the format that this one extends.
     for key in [key for key, value in options.items() if value == "needed"]:
         raise UsageError(f"format.{key} needs a value: format.{key}=...")
-    hints = get_type_hints(reader.__init__)  # type: ignore[misc]
+    hints = get_type_hints(reader.__init__, include_extras=True)  # type: ignore[misc]
     _, *parameters = inspect.signature(reader).parameters.values()
     fields: dict[str, Any] = {
         p.name: (hints[p.name], ... if p.default is p.empty else p.default) for p in parameters

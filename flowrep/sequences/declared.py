@@ -7,19 +7,23 @@ from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from glob import escape
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import Field
 
 from flowrep import geometry
+from flowrep.config.options import Positive
 from flowrep.sequences import calibration, files, matching
 from flowrep.sequences.calibration import Matrix, as_pose, camera_matrix
 from flowrep.sequences.matching import Floats, Indices, LeftOut, match_times
 from flowrep.sequences.recording import Frame, Recording, SequenceError
 from flowrep.sequences.video import VIDEOS, VideoPictures
+
+Bounds = Annotated[Sequence[float | str], Field(min_length=2, max_length=2)]
 
 
 @dataclass(eq=False)
@@ -61,14 +65,14 @@ class DeclaredRecording(Recording):
     pose_layout: geometry.PoseLayout
     pose_direction: geometry.PoseDirection
     pose_axes: geometry.CameraAxes
-    pose_unit_m: float
+    pose_unit_m: Positive
     marker_from_cam: Sequence[float] | None
     intrinsics_kind: calibration.IntrinsicsKind
     first_pixel_centre: float
     distortion: Sequence[float]
     lens: calibration.Lens
     resize_rgb: bool
-    depth_unit_m: float | None
+    depth_unit_m: Positive | None
     depth_kind: geometry.DepthKind
     near_m: float | None
     far_m: float | None
@@ -78,22 +82,15 @@ class DeclaredRecording(Recording):
     depth_no_surface: int | None
     depth_inf: Literal["no_surface", "missing"]
     min_confidence: int
-    flow_range: Literal["size"] | Sequence[float | str]
+    flow_range: Literal["size"] | Bounds
     flow_marks_unknown: bool
-    flow_unit_px: float
+    flow_unit_px: Positive
     flow_to: Literal["previous", "next"]
     flow_direction: geometry.Direction
     flow_channels: geometry.Channels
 
     def __post_init__(self) -> None:
         self.folder = Path(self.folder)
-        for name in ("depth_unit_m", "pose_unit_m", "flow_unit_px"):
-            if (unit := getattr(self, name)) is not None and not unit > 0:
-                raise ValueError(f"{name} must be positive, got {unit}")
-        if self.flow_range != "size" and len(self.flow_range) != 2:
-            raise ValueError(
-                f"flow_range is size, or the least and the most, not {self.flow_range}"
-            )
         for word in ("scene", "camera", "render"):
             if getattr(self, word) is not None and f"{{{word}}}" not in str(vars(self)):
                 raise SequenceError(f"format.{word}", "stands in no file's name of this format")
