@@ -6,7 +6,6 @@ What needs PyTorch, which takes seconds to import, is imported when the config h
 from __future__ import annotations
 
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +18,7 @@ from flowrep.config.folders import folder_name
 from flowrep.config.usage import UsageError
 from flowrep.experiment.policies import policy_of
 from flowrep.experiment.schema import ViewConfig
-from flowrep.files import replace_file, write_rows
+from flowrep.files import replace_file
 from flowrep.progress import progress_bar
 from flowrep.viz import contact_sheet, write_png, write_video
 
@@ -30,12 +29,12 @@ if TYPE_CHECKING:
     from flowrep.scenes import Scene
 
 ENVS = 16  # side by side, for the episodes that are not filmed
-FILES = ("sheet.png", "episode.mp4", "plan.png", "episodes.csv")
+FILES = ("sheet.png", "episode.mp4", "plan.png")
 """The files of a view; a new view replaces all of them."""
 
 
 def run(config: ViewConfig) -> None:
-    """Writes pictures, a film and tables of the scene."""
+    """Writes pictures and a film of the scene."""
     policy_of(config.policy)  # refuses a wrong name before PyTorch is imported
 
     from flowrep.experiment.film import Film
@@ -81,7 +80,7 @@ def episodes_of(config: ViewConfig, scene: Scene) -> list[dict[str, Any]]:
 
 
 def view(config: ViewConfig, agent: Agent, film: Film) -> None:
-    """Drives episodes and writes their pictures, plan, film and table into a folder."""
+    """Drives episodes and writes their pictures, plan and film into a folder."""
     from flowrep.experiment.outcomes import print_table
     from flowrep.scenes.layout import Layout
     from flowrep.viz.plan import Track, draw_plan
@@ -94,11 +93,9 @@ def view(config: ViewConfig, agent: Agent, film: Film) -> None:
     tracks = [Track(each.positions.astype(float), each.outcome) for each in episodes]
     # Closed exits belong to a path; they are drawn if all episodes took the same one.
     path = episode.path if all(each.path == episode.path for each in episodes) else None
-    origin = agent.origin("view") | {"policy": config.policy}
-    table = [replace(each, **origin).row() for each in episodes]
     folder.mkdir(parents=True, exist_ok=True)
-    rows = config.sheet_rows
-    moments = [frames[len(frames) * (2 * i + 1) // (2 * rows)] for i in range(rows)]
+    count = config.sheet_rows
+    moments = [frames[len(frames) * (2 * i + 1) // (2 * count)] for i in range(count)]
     write_png(folder / "sheet.png", contact_sheet(map(film.draw, moments)))
     if config.video:
         pictures = progress_bar(film.pictures(frames, episode), desc="drawing", unit="frame")
@@ -107,9 +104,9 @@ def view(config: ViewConfig, agent: Agent, film: Film) -> None:
         (folder / "episode.mp4").unlink(missing_ok=True)
     with replace_file(folder / "plan.png") as partial:
         draw_plan(Layout(scene), tracks, path=path).savefig(partial, dpi=110)
-    write_rows(folder / "episodes.csv", table)
     shown = ("path", "episode_seed", "outcome", "hit", "return", "length")
-    print_table("episodes", [{name: row[name] for name in shown} for row in table])
+    rows = [each.row() for each in episodes]
+    print_table("episodes", [{name: row[name] for name in shown} for row in rows])
     arrived = sum(each.outcome == "success" for each in episodes)
     print(f"{config.policy}: {arrived} of {len(episodes)} episodes end in success")
     print(f"{folder}: {', '.join(each for each in FILES if (folder / each).is_file())}")
