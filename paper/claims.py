@@ -30,6 +30,7 @@ UNSEEN = "not seen with this recipe"
 _CLAIMED = {"more": "higher", "less": "lower"}
 _DRAWS = 20_000  # of permutations: the standard error of p = 0.05 is then 0.0015
 _COLLAPSED = 0.2  # success at its training speeds below which a run counts as collapsed
+_ROUNDS = 3  # complete ones, before contrasts at the paper's length are computed
 
 Studies = Mapping[str, Mapping[str, Sequence[Run]]]
 
@@ -176,7 +177,7 @@ def claims_of(
 def at_length(declared: Mapping[str, Any], studies: Studies) -> dict[int, Contrast]:
     """Returns contrasts of the paper's number of frames, paired by seed, by the row of the claim.
 
-    Each family has a correction of its own.
+    Each family has a correction of its own. The protocol asks for three complete rounds.
     """
     asked, found = declared.get("at_length", {"families": []}), {}
     entries = [*declared["primary"], *declared["secondary"]]
@@ -191,7 +192,11 @@ def at_length(declared: Mapping[str, Any], studies: Studies) -> dict[int, Contra
         ]
         _correct(contrasts)
         found |= dict(zip(family, contrasts))
-    return {row: contrast for row, contrast in found.items() if contrast.effect}
+    return {
+        row: contrast
+        for row, contrast in found.items()
+        if contrast.effect and contrast.effect.freedom >= _ROUNDS - 1
+    }
 
 
 def _correct(contrasts: Sequence[Contrast]) -> None:
