@@ -1,5 +1,6 @@
 """Long loops: how far one is, where its time goes, and a stop between two of its steps."""
 
+import io
 import os
 import select
 import signal
@@ -14,12 +15,18 @@ from typing import Any, ClassVar
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 """Ctrl-C; what schedulers send; a closed terminal; what SLURM's --signal=USR1@300 sends."""
 
-LOG_EVERY_S = 30.0
+LINE_EVERY_S = 30.0
 _LOCK = threading.RLock()
 
 
-def progress_bar(iterable: Any = None, **options: Any) -> Any:
-    """Returns a tqdm bar of tqdm's options, which prints twice a minute where that is to a file."""
+def progress_bar(iterable: Any = None, *, what: str, **options: Any) -> Any:
+    """Returns a tqdm bar; where stderr is no terminal, it prints a plain line each half minute.
+
+    Args:
+        iterable: what the bar counts, as for tqdm; None to count with `update`.
+        what: begins the plain lines, and a terminal's bar unless `desc` is given.
+        options: those of tqdm.
+    """
     from tqdm.asyncio import tqdm_asyncio  # here, as envs import this module and need no tqdm
     from tqdm.auto import tqdm
 
@@ -27,9 +34,29 @@ def progress_bar(iterable: Any = None, **options: Any) -> Any:
     # tracker, and a hang-up would make that print a traceback.
     tqdm.set_lock(_LOCK)
     is_notebook = tqdm is not tqdm_asyncio
-    if not (sys.stderr.isatty() or is_notebook):
-        options |= {"mininterval": LOG_EVERY_S, "maxinterval": LOG_EVERY_S}
-    return tqdm(iterable, **options)
+    if sys.stderr.isatty() or is_notebook:
+        return tqdm(iterable, **{"desc": what} | options)
+    line = what + ": {n_fmt} {unit}s, {rate_fmt}{postfix}"
+    if options.get("total") is not None or hasattr(iterable, "__len__"):
+        line = what + ": {n_fmt} of {total_fmt} {unit}s, {rate_fmt}, {remaining} left{postfix}"
+    return tqdm(iterable, **options | {"file": _Lines(), "bar_format": line})
+
+
+class _Lines(io.TextIOBase):
+    """A file for tqdm that prints its text as a line each half minute, without cursor moves."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._written_at = time.monotonic()
+
+    def write(self, text: str) -> int:
+        line, now = text.strip("\r\n "), time.monotonic()
+        # A bar that is below another one moves the cursor first.
+        if line and not line.startswith("\x1b") and now - self._written_at >= LINE_EVERY_S:
+            self._written_at = now
+            sys.stderr.write(f"{line}\n")
+            sys.stderr.flush()
+        return len(text)
 
 
 class Stopwatch:

@@ -107,8 +107,9 @@ def run_sweep() -> NoReturn:
 
 def state_of(log: Path) -> str:
     """Returns how the last attempt of a run ended, by its log."""
-    last = log.read_text(encoding="utf-8", errors="replace").rpartition("--- ")[2].strip()
-    return STOPPED if last.startswith(BEGUN) else last
+    last = log.read_text(encoding="utf-8", errors="replace").rstrip("\n").rpartition("\n")[2]
+    has_ended = last.startswith("--- ") and not last.startswith(f"--- {BEGUN}")
+    return last.removeprefix("--- ") if has_ended else STOPPED
 
 
 def job(config: DictConfig) -> None:

@@ -87,7 +87,7 @@ def view(config: ViewConfig, agent: Agent, film: Film) -> None:
 
     scene = film.street.scene
     options, folder = episodes_of(config, scene), folder_of(config, scene)
-    with progress_bar(desc="driving", unit="frame") as bar:
+    with progress_bar(what="driving", unit="frame") as bar:
         frames, episode = film.drive(options[0], lambda _: bar.update())
     episodes = [episode, *drive_on(config, agent, options[1:])]
     tracks = [Track(each.positions.astype(float), each.outcome) for each in episodes]
@@ -98,7 +98,7 @@ def view(config: ViewConfig, agent: Agent, film: Film) -> None:
     moments = [frames[len(frames) * (2 * i + 1) // (2 * count)] for i in range(count)]
     write_png(folder / "sheet.png", contact_sheet(map(film.draw, moments)))
     if config.video:
-        pictures = progress_bar(film.pictures(frames, episode), desc="drawing", unit="frame")
+        pictures = progress_bar(film.pictures(frames, episode), what="drawing", unit="frame")
         write_video(folder / "episode.mp4", pictures, fps=episode.fps)
     else:  # an earlier view may have had one
         (folder / "episode.mp4").unlink(missing_ok=True)
@@ -122,7 +122,7 @@ def drive_on(
         return []
     with closing(agent.make_env(**street_of(config), num_envs=min(ENVS, len(options)))) as env:
         ended = evaluate(env, agent.policy, options)
-        counted = progress_bar(ended, desc="driving on", unit="episode", total=len(options))
+        counted = progress_bar(ended, what="driving on", unit="episode", total=len(options))
         episodes = list(counted)
     return sorted(episodes, key=lambda episode: episode.episode_seed)
 

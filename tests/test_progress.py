@@ -57,15 +57,27 @@ def test_the_previous_handlers_come_back():
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-def test_in_a_log_a_bar_is_printed_each_half_minute(monkeypatch, capsys):
+# What a bar writes into a file.
+
+
+def test_in_a_log_a_line_comes_every_half_minute_also_of_a_bar_below_another(monkeypatch, capsys):
     now = [0.0]
-    monkeypatch.setattr("tqdm.std.time", lambda: now[0])
-    with progress_bar(total=100, miniters=0, mininterval=0) as bar:
+    monkeypatch.setattr("flowrep.progress.time.monotonic", lambda: now[0])
+    often = {"miniters": 0, "mininterval": 0}
+    with progress_bar(what="training", desc=None, total=100, unit="frame", **often) as bar:
+        bar.set_postfix_str("success 3%")
         for now[0] in range(1, 71):  # a second each
             bar.update()
-        bar.leave = False
-    printed = re.findall(r"(\d+)/100", capsys.readouterr().err)
-    assert printed == ["0", "30", "60"]
+        seconds = range(71, 111)
+        for now[0] in progress_bar(seconds, what="evaluating", unit="episode", **often):
+            pass
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.partition("s, ")[0] for line in lines] == [
+        "training: 30 of 100 frame", "training: 60 of 100 frame", "evaluating: 30 of 40 episode",
+        "training: 70 of 100 frame",
+    ]  # fmt: skip
+    line = r"training: 60 of 100 frames, [\d.]+\w?frame/s, [\d:]+ left, success 3%"
+    assert re.fullmatch(line, lines[1])
 
 
 CHILDREN = """
@@ -73,7 +85,7 @@ import multiprocessing, os
 from flowrep.progress import progress_bar
 
 multiprocessing.set_start_method("spawn")  # as TorchRL does
-for _ in progress_bar(range(3), desc="counting"):
+for _ in progress_bar(range(3), what="counting"):
     pass
 print(open(f"/proc/self/task/{os.getpid()}/children").read())
 """
@@ -105,7 +117,7 @@ from pathlib import Path
 from flowrep.progress import progress_bar
 from flowrep.progress import StopRequest
 
-with StopRequest() as stop, progress_bar(desc="x", total=9, mininterval=0, miniters=0) as bar:
+with StopRequest() as stop, progress_bar(what="x", total=9, mininterval=0, miniters=0) as bar:
     print("ready", flush=True)
     while not stop:
         bar.update(0)

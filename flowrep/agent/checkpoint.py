@@ -16,6 +16,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import zlib
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
@@ -56,13 +57,19 @@ def save_checkpoint(path: str | os.PathLike[str], state: Mapping[str, Any]) -> N
         with naming(path):
             path.parent.mkdir(parents=True, exist_ok=True)
         with replace_file(path) as partial:
-            try:
-                save_file(tensors, partial, metadata=metadata)
-            except SafetensorError as error:  # an error of the disk, which its text names
-                raise OSError(errno.EIO, str(error)) from error
+            _write(tensors, metadata, partial)
     except OSError as error:
         kept = "; the previous checkpoint is untouched" if path.exists() else ""
         raise CheckpointError(f"cannot write the checkpoint: {error}{kept}") from error
+
+
+def _write(tensors: dict[str, Tensor], metadata: dict[str, str], path: Path) -> None:
+    try:
+        save_file(tensors, path, metadata=metadata)
+    except SafetensorError as error:  # an error of the disk; the errno is only in its text
+        code = re.search(r"(?:os error |code: )(\d+)", str(error))
+        number = int(code[1]) if code else errno.EIO
+        raise OSError(number, os.strerror(number)) from error
 
 
 def load_checkpoint(

@@ -30,12 +30,15 @@ VectorFactory = Callable[[Sequence[EnvFactory]], SyncVectorEnv]
 _SIDE_BY_SIDE = partial(SyncVectorEnv, copy=False, autoreset_mode=AutoresetMode.DISABLED)
 
 
+PATIENCE_S = 300.0
+"""How long a worker may take to answer: it starts in seconds and steps in milliseconds, but the
+machine may be busy."""
 PATIENCE_AT_THE_END_S = 5.0
 """How long workers may take to end before they are killed."""
 
 
 class WorkerError(RuntimeError):
-    """A worker process failed or died; the message names its envs."""
+    """A worker process failed, died or doesn't answer; the message names its envs."""
 
 
 class WorkerVectorEnv(VectorEnv):
@@ -61,7 +64,8 @@ class WorkerVectorEnv(VectorEnv):
 
     Raises:
         ValueError: there are more workers than envs.
-        WorkerError: a worker could not start; any method raises it if a worker has ended.
+        WorkerError: a worker could not start; any method raises it if a worker has ended or does
+            not answer.
     """
 
     def __init__(
@@ -192,11 +196,20 @@ class _Worker:
         self._owes_answer = True
 
     def receive(self) -> Any:
-        result, failure = self._talk(self.pipe.recv)
+        result, failure = self._talk(self._receive_within_patience)
         self._owes_answer = False
         if failure:
             raise WorkerError(f"the worker process of {self.name} failed:\n{failure}")
         return result
+
+    def _receive_within_patience(self) -> Any:
+        if not self.pipe.poll(PATIENCE_S):
+            pid = self.process.pid
+            raise WorkerError(
+                f"the worker process of {self.name} has not answered for {PATIENCE_S:g} s: if "
+                f"process {pid} is suspended, resume it with 'kill -CONT {pid}'"
+            )
+        return self.pipe.recv()
 
     def _talk(self, act: Callable[..., Any], *args: Any) -> Any:
         try:

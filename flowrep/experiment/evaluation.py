@@ -250,7 +250,7 @@ class PairedEvaluation:
             if name in self.policies:
                 group.clear()
         with progress_bar(
-            desc="evaluating", total=self.total, initial=self.done, unit="episode", leave=False,
+            what="evaluating", total=self.total, initial=self.done, unit="episode", leave=False,
             miniters=0, mininterval=0.5,
         ) as bar:  # fmt: skip
             # Each frame redraws the bar's clock, since the first episodes take seconds.

@@ -96,8 +96,8 @@ class Runner:
             self.evaluation_pending = not self.evaluate("training", stop)
         # No `desc`: the metrics at the line's end need the columns.
         with progress_bar(
-            total=total, initial=self.frames, unit="frame", unit_scale=True,
-            miniters=0, mininterval=0.5, dynamic_ncols=True,
+            what="training", desc=None, total=total, initial=self.frames, unit="frame",
+            unit_scale=True, miniters=0, mininterval=0.5, dynamic_ncols=True,
         ) as bar:  # fmt: skip
             while self.frames < total and not stop:
                 with self.clock("policy"):

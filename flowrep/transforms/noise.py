@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import multiprocessing
+import zlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -12,7 +14,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 
-from flowrep.geometry.checks import checked_number
+from flowrep.geometry.checks import checked_count, checked_number
 from flowrep.geometry.pose import rotation_from_vector
 from flowrep.transforms import base
 from flowrep.transforms.base import Keys, MapTransform, Reads, as_keys, check_choice
@@ -62,11 +64,12 @@ class SensorNoise(MapTransform):
 
     With `frame_key`, noise is a function of the integers that identify a frame, e.g. episode and
     step. A frame gets the same noise in any batch, order, process or session, at the root and under
-    `"next"`.
+    `"next"`, and there is no state to save.
 
-    Without it, each call draws new noise from PyTorch's generator. On a replay buffer that is
-    augmentation: the root and `"next"` get independent errors. The workers of a `ParallelEnv` draw
-    the same noise until `set_seed` gives each a seed.
+    Without it, each call draws new noise. On a replay buffer that is augmentation: the root and
+    `"next"` get independent errors. The calls so far are counted in `state_dict`, so that a resumed
+    run continues the sequence. The envs of a `SerialEnv` or `ParallelEnv` draw independent noise
+    unless all get the same seed, or are copies of an env that has been used.
 
     Args:
         sensors: which of `"depth"`, `"motion"` and `"flow"` to read and write.
@@ -75,6 +78,9 @@ class SensorNoise(MapTransform):
         drift_m: standard deviation per step of the motion's translation along each axis, metres.
         drift_rad: standard deviation per step of its rotation about each axis, radians.
         flow_sigma_px: standard deviation of each flow channel, pixels per step.
+        seed: envs with the same seed have the same noise. None draws one from torch's global
+            generator (`torch.manual_seed` makes it reproducible), and adds the name of the worker
+            process; with `frame_key`, None is 0.
         frame_key: key of the integers that identify the frame, such as StreetEnv's
             `("sensor", "frame")`.
         in_keys: one key for each sensor; the table's by default.
@@ -92,6 +98,9 @@ class SensorNoise(MapTransform):
         (True, True)
     """
 
+    # What distinguishes calls without frames: a number drawn, and the count of calls.
+    drawn_and_calls: Tensor | None
+
     def __init__(
         self,
         *,
@@ -101,6 +110,7 @@ class SensorNoise(MapTransform):
         drift_m: float = 0.0,
         drift_rad: float = 0.0,
         flow_sigma_px: float = 0.0,
+        seed: int | None = None,
         frame_key: NestedKey | None = None,
         in_keys: Keys | None = None,
         out_keys: Keys | None = None,
@@ -131,6 +141,11 @@ class SensorNoise(MapTransform):
             writes=len(sensors),
         )
         self.sensors, self.options = tuple(sensors), options
+        self.seed = None if seed is None else checked_count("seed", seed, 0)
+        state = None if frame else torch.zeros(2, dtype=torch.int64)
+        if state is not None and seed is None:
+            state[0] = torch.randint(2**62, ())
+        self.register_buffer("drawn_and_calls", state)
 
     def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
         maps = super()._read(tensordict)
@@ -141,36 +156,52 @@ class SensorNoise(MapTransform):
 
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
         """Returns the sensors' maps with noise; with `frame_key`, frames are the last map."""
-        frame = maps[-1] if len(maps) > len(self.sensors) else None
+        state = self.drawn_and_calls
+        batch = maps[0].shape[: maps[0].ndim - len(self.reads[0].shape)]
+        frame = maps[-1] if state is None else self._next_frames(state, batch, maps[0].device)
         return tuple(self._noisy(sensor, x, frame) for sensor, x in zip(self.sensors, maps))
 
-    def _noisy(self, sensor: str, value: Tensor, frame: Tensor | None) -> Tensor:
-        reads, _, names = NOISY_SENSORS[sensor]
-        options = [self.options[name] for name in names]
+    def _noisy(self, sensor: str, value: Tensor, frame: Tensor) -> Tensor:
+        options = [self.options[name] for name in NOISY_SENSORS[sensor].options]
         if not any(options):
             return value
-        own_dims = len(reads.shape)
-        batch, size = value.shape[:-own_dims], value.shape[-own_dims:]
-        shape = (6,) if sensor == "motion" else tuple(size)
-        if frame is None:
-            normals, uniforms = (
-                draw((*batch, *shape), device=value.device) for draw in (torch.randn, torch.rand)
-            )
-        else:
-            bits = frame_bits(frame, shape, stream=list(NOISY_SENSORS).index(sensor))
-            normals, uniforms = normal(bits), uniform(bits)
-        normals = normals.to(value.dtype)
+        shape = (6,) if sensor == "motion" else tuple(value.shape[frame.ndim - 1 :])
+        stream = list(NOISY_SENSORS).index(sensor)
+        bits = frame_bits(frame, shape, seed=self.seed or 0, stream=stream)
+        normals = normal(bits).to(value.dtype)
         if sensor == "depth":
             sigma, dropout = options
-            return noisy_depth(value, normals, uniforms, sigma_per_m=sigma, dropout=dropout)
+            return noisy_depth(value, normals, uniform(bits), sigma_per_m=sigma, dropout=dropout)
         if sensor == "motion":
             return drifted_motion(value, normals, drift_m=options[0], drift_rad=options[1])
         return value + options[0] * normals
+
+    def _next_frames(self, state: Tensor, batch: Sequence[int], device: torch.device) -> Tensor:
+        """Returns integers `[*B, 3]` that no other call has: what was drawn, the call, the row."""
+        drawn, calls = state.to(device).unbind()
+        if self.seed is None:  # at the first call, which a worker makes in its process
+            drawn = torch.where(calls == 0, drawn ^ _number_of_process(), drawn)
+        rows = torch.arange(math.prod(batch), device=device).reshape(batch)
+        frames = torch.stack([drawn.expand(batch), calls.expand(batch), rows], -1)
+        following = torch.stack([drawn, calls + 1])
+        if torch.compiler.is_exporting():  # a program has a buffer of its own, and counts in it
+            state.copy_(following)
+        else:  # copies of the transform, such as TorchRL's shallow clones, have it in common
+            self.drawn_and_calls = following
+        return frames
 
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
         """Returns unbounded specs, as errors are unbounded."""
         seen = specs[: len(self.out_keys)]  # without the frame's
         return tuple(Unbounded(s.shape, device=s.device, dtype=s.dtype) for s in seen)
+
+
+@torch.compiler.assume_constant_result
+def _number_of_process() -> int:
+    """Returns a number that differs between worker processes."""
+    # Forked workers share the state of torch's generator, spawned ones its default seed: only their
+    # names differ.
+    return zlib.crc32(multiprocessing.current_process().name.encode())
 
 
 def noisy_depth(
@@ -212,12 +243,12 @@ def split_mix(state: Tensor) -> Tensor:
     return z
 
 
-def frame_bits(frame: Tensor, shape: Sequence[int], *, stream: int) -> Tensor:
+def frame_bits(frame: Tensor, shape: Sequence[int], *, seed: int, stream: int) -> Tensor:
     """Returns 64 random bits for each element, int64 `[*B, *shape]`, of frames `[*B, N]`.
 
     N integers identify a frame; `stream`, a small number, distinguishes its sensors.
     """
-    start = torch.zeros_like(frame[..., 0], dtype=torch.int64)
+    start = torch.full_like(frame[..., 0], seed, dtype=torch.int64)
     for number in (torch.full_like(start, stream), *frame.long().unbind(-1)):
         start = split_mix(start) ^ number
     start = split_mix(start)

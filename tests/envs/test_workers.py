@@ -162,11 +162,15 @@ def test_workers_block_stop_signals_from_their_start(make):
     assert not signal.pthread_sigmask(signal.SIG_BLOCK, ()) & asked
 
 
-def test_a_suspended_worker_is_killed_at_the_end(make, monkeypatch):
+def test_a_suspended_worker_is_named_and_killed(make, monkeypatch):
     env = make(4, 2)
+    env.reset(seed=0)
     process = env._workers[1].process
     os.kill(process.pid, signal.SIGSTOP)
+    monkeypatch.setattr(workers, "PATIENCE_S", 0.5)
     monkeypatch.setattr(workers, "PATIENCE_AT_THE_END_S", 0.5)
+    with pytest.raises(WorkerError, match=rf"environments 2 to 3 .*CONT {process.pid}'"):
+        env.step(np.array([1, 1, 1, 1]))
     env.close()
     assert process.exitcode == -signal.SIGKILL
 

@@ -124,6 +124,28 @@ def test_a_stack_is_compiled_and_exported_and_runs_on_meta_tensors(camera):
     assert all(each.is_meta for each in used.to("meta")(*(x.to("meta") for x in given)))
 
 
+class Noisy(torch.nn.Module):
+    """Draws new noise at each call."""
+
+    def __init__(self):
+        super().__init__()
+        self.noise = T.SensorNoise(**NOISE, seed=1)
+
+    def forward(self, *maps):
+        return self.noise.compute(*maps)
+
+
+def test_noise_that_is_drawn_anew_is_compiled_and_exported_and_runs_on_meta_tensors():
+    eager, given = Noisy(), tuple(inputs(T.SensorNoise(), moments(3)))
+    compiled = torch.compile(Noisy(), fullgraph=True, backend="eager")
+    exported = torch.export.export(Noisy(), given).module()
+    for _ in range(3):
+        want = eager(*given)
+        for run in (compiled, exported):
+            torch.testing.assert_close(run(*given), want, rtol=0, atol=0, equal_nan=True)
+    assert all(each.is_meta for each in Noisy().to("meta")(*(x.to("meta") for x in given)))
+
+
 CHECKED = {
     "AdaptPose": (T.AdaptPose(in_keys="x"), torch.eye(4)),
     "InstanceIds": (T.InstanceIds([3], in_keys="x"), torch.tensor([[[3, 0, 3]]])),
@@ -185,3 +207,17 @@ def test_a_gpu_gives_what_the_cpu_gives_without_waiting(case):
     for on_gpu, expected in zip(got, want):
         assert on_gpu.is_cuda
         torch.testing.assert_close(on_gpu.cpu(), expected, atol=1e-5, rtol=1e-5, equal_nan=True)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_noise_is_drawn_on_the_gpu_without_waiting():
+    noise = T.SensorNoise(**NOISE)
+    td = moments(3).to("cuda")
+    noise.compute(*inputs(noise, td))
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        depth, motion = noise.compute(*inputs(noise, td))
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert depth.is_cuda
+    assert motion.is_cuda

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import copy
+import functools
 import itertools
 import math
+import pickle
 
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import TransformedEnv
+from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv
 
 from flowrep.geometry import check_rigid
 from flowrep.transforms import SensorNoise
@@ -83,14 +86,39 @@ def test_each_option_changes_its_own_sensor_alone():
         assert [i for i, equal in enumerate(same) if not equal] == [changed], option
 
 
-def test_each_call_draws_anew_from_torch_s_generator():
-    def two_calls() -> torch.Tensor:
-        torch.manual_seed(5)
-        noise = SensorNoise(**ALL)
-        return torch.stack([noise.compute(*maps())[2] for _ in range(2)])
+def test_a_seed_gives_a_sequence_and_another_seed_or_torch_s_own_another():
+    def sequence(torch_s: int, seed: int | None) -> torch.Tensor:
+        torch.manual_seed(torch_s)
+        noise = SensorNoise(**ALL, seed=seed)
+        return torch.stack([noise.compute(*maps())[2] for _ in range(3)])
 
-    assert torch.equal(two_calls(), two_calls())
-    assert not torch.equal(*two_calls())
+    first = sequence(5, 1)
+    assert torch.equal(sequence(6, 1), first)  # the global generator has no part in it
+    assert not torch.equal(first[0], first[1])
+    drawn = sequence(5, None)
+    assert torch.equal(sequence(5, None), drawn)
+    for other in (sequence(5, 2), drawn, sequence(6, None)):
+        assert not torch.equal(other, first)
+    assert not torch.equal(sequence(6, None), drawn)
+
+
+@pytest.mark.parametrize("calls", [0, 3])
+def test_a_resumed_run_goes_on_in_the_same_sequence(calls):
+    noise = SensorNoise(**ALL, seed=1)
+    for _ in range(calls):
+        noise.compute(*maps())
+    saved = noise.state_dict()
+    copies = [copy.deepcopy(noise), pickle.loads(pickle.dumps(noise)), noise.clone()]
+    noise.clone().compute(*maps())  # as an evaluation's env does: the original goes on unchanged
+    want = [noise.compute(*maps())[2] for _ in range(2)]
+    resumed = SensorNoise(**ALL, seed=1)
+    resumed.compute(*maps())  # whatever it did before
+    resumed.load_state_dict(saved)
+    for again in (resumed, *copies):
+        assert all(torch.equal(again.compute(*maps())[2], w) for w in want)
+    unused = SensorNoise(**ALL, seed=1)
+    unused.load_state_dict(saved)
+    torch.testing.assert_close(unused.state_dict(), saved)  # loaded and saved again before use
 
 
 def frames(count: int) -> torch.Tensor:
@@ -116,7 +144,7 @@ def test_a_frame_has_its_noise_in_any_batch_bit_for_bit():
         assert torch.equal(single.nan_to_num(), whole[333].nan_to_num())
 
 
-def test_noise_by_frame_is_the_same_at_the_root_and_under_next():
+def test_noise_by_frame_is_in_no_state_and_the_same_at_the_root_and_under_next():
     noise = SensorNoise(**ALL, frame_key=("sensor", "frame"))
     depth, motion, flow = maps(6)
 
@@ -124,9 +152,30 @@ def test_noise_by_frame_is_the_same_at_the_root_and_under_next():
         sensor = {"depth": depth, "prev_from_curr": motion, "frame": frames(6)}
         return TensorDict({"sensor": sensor, "raw": flow}, [6])[rows].clone()
 
+    before = noise.state_dict()
     batch = noise(moments(slice(0, 5)).set("next", moments(slice(1, 6))))
     assert torch.equal(batch["raw"][1:], batch["next", "raw"][:-1])
     assert not torch.equal(batch["raw"][:1], batch["next", "raw"][:1])
+    torch.testing.assert_close(noise.state_dict(), before)
+    assert not any(len(value) for value in before.values())
+
+
+def noisy_env() -> TransformedEnv:
+    return TransformedEnv(FakeSensorEnv(), SensorNoise(drift_m=0.5))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "batched", [SerialEnv, functools.partial(ParallelEnv, mp_start_method="fork")]
+)
+def test_envs_of_one_function_draw_noise_of_their_own(batched):
+    # Env 0 twice: what differs between the two is the noise alone.
+    env = batched(2, noisy_env)
+    try:
+        motion = env.rollout(2)["sensor", "prev_from_curr"][:, :, :3, 3]
+    finally:
+        env.close()
+    assert (motion[0] != motion[1]).all()
 
 
 def test_noise_by_frame_needs_the_frame_s_name():
@@ -163,7 +212,7 @@ def test_numbers_of_known_bits_by_hand():
 def test_numbers_by_frame_are_spread_as_they_should_be_and_neighbours_have_nothing_in_common():
     # A million numbers: 100 frames of 100 episodes, 100 of each. Limits are five standard errors.
     million, frame = 1_000_000, torch.cartesian_prod(torch.arange(100), torch.arange(100))
-    bits = frame_bits(frame.reshape(100, 100, 2), (100,), stream=0)
+    bits = frame_bits(frame.reshape(100, 100, 2), (100,), seed=0, stream=0)
     x, u = normal(bits), uniform(bits)
     steps = torch.linspace(0, 1, million, dtype=torch.float64)
     of_normal = 0.5 * (1 + torch.erf(x.double() / math.sqrt(2)))
@@ -177,6 +226,9 @@ def test_numbers_by_frame_are_spread_as_they_should_be_and_neighbours_have_nothi
 
 
 def test_every_part_of_the_name_counts():
-    same = frame_bits(torch.tensor([[12, 0]]), (50,), stream=1)
-    for name, stream in [([12, 0], 2), ([12, 1], 1), ([0, 12], 1), ([12], 1)]:
-        assert not (frame_bits(torch.tensor([name]), (50,), stream=stream) == same).any()
+    same = frame_bits(torch.tensor([[12, 0]]), (50,), seed=3, stream=1)
+    for name, seed, stream in [
+        *(([12, 0], 4, 1), ([12, 0], 3, 2)),
+        *(([12, 1], 3, 1), ([0, 12], 3, 1), ([12], 3, 1)),
+    ]:
+        assert not (frame_bits(torch.tensor([name]), (50,), seed=seed, stream=stream) == same).any()

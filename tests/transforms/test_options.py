@@ -22,6 +22,7 @@ MISTAKES = {
     r"drift_m.* inf": lambda: T.SensorNoise(drift_m=math.inf),
     r"depth_dropout.* 1\.5": lambda: T.SensorNoise(depth_dropout=1.5),
     r"flow_sigma_px.*'flow'": lambda: T.SensorNoise(flow_sigma_px=1.0),
+    r"seed.* 1\.5": lambda: T.SensorNoise(seed=1.5),
     r"writes 2 keys": lambda: T.SensorNoise(out_keys=["only"]),
     r"k must be .* 0": lambda: frames(k=0, out_keys=["seg2"]),
     r"k must be .* 1\.5": lambda: frames(k=1.5, out_keys=["seg2"]),
