@@ -5,7 +5,9 @@ What needs PyTorch, which takes seconds to import, is imported when the config h
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import closing
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -94,9 +96,8 @@ def view(config: ViewConfig, agent: Agent, film: Film) -> None:
     # Closed exits belong to a path; they are drawn if all episodes took the same one.
     path = episode.path if all(each.path == episode.path for each in episodes) else None
     folder.mkdir(parents=True, exist_ok=True)
-    count = config.sheet_rows
-    moments = [frames[len(frames) * (2 * i + 1) // (2 * count)] for i in range(count)]
-    write_png(folder / "sheet.png", contact_sheet(map(film.draw, moments)))
+    chosen = moments([moving_pixels(frame.maps) for frame in frames], config.sheet_rows)
+    write_png(folder / "sheet.png", contact_sheet(film.draw(frames[i]) for i in chosen))
     if config.video:
         pictures = progress_bar(film.pictures(frames, episode), what="drawing", unit="frame")
         write_video(folder / "episode.mp4", pictures, fps=episode.fps)
@@ -125,6 +126,21 @@ def drive_on(
         counted = progress_bar(ended, what="driving on", unit="episode", total=len(options))
         episodes = list(counted)
     return sorted(episodes, key=lambda episode: episode.episode_seed)
+
+
+def moving_pixels(maps: Mapping[str, Any]) -> int:
+    """Returns how many pixels show a moving object more than 4 m from the camera."""
+    return int(((maps["obj"] != 0).any(0) & (maps["depth"][0] > 4.0)).sum())
+
+
+def moments(motion: list[int], count: int) -> list[int]:
+    """Returns frame indices for a contact sheet: the one with most motion in each of `count` parts.
+
+    >>> moments([0, 0, 3, 1, 0, 0, 0, 2], 2)
+    [2, 7]
+    """
+    ends = [round(i * len(motion) / count) for i in range(count + 1)]
+    return [max(range(a, b), key=lambda i: motion[i]) for a, b in pairwise(ends) if b > a]
 
 
 def main() -> None:

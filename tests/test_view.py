@@ -5,6 +5,7 @@ from contextlib import closing
 
 import imageio.v3 as imageio
 import pytest
+import torch
 
 pytest.importorskip("pybullet", reason="the command needs the simulator")
 
@@ -21,6 +22,8 @@ from flowrep.view import (
     episodes_of,
     folder_of,
     main,
+    moments,
+    moving_pixels,
     view,
 )
 from tests.config.composing import plain
@@ -141,3 +144,21 @@ def test_a_policy_from_a_file_needs_its_representations():
 def test_every_episode_takes_the_path_asked_for():
     config = asked("policy=never_turn", "scene=three_way_junction", "path=right", "episodes=6")
     assert [episode.path for episode in driven(config)] == ["right"] * 6
+
+
+@pytest.mark.parametrize(
+    ("motion", "rows", "expected"),
+    [
+        ([5, 1, 1], 1, [0]),
+        ([1, 2], 6, [0, 1]),  # an episode of fewer frames than rows: each of them once
+    ],
+)
+def test_a_sheet_shows_the_moment_with_most_motion_of_each_part(motion, rows, expected):
+    assert moments(motion, rows) == expected
+
+
+def test_only_moving_pixels_beyond_four_metres_count_for_the_sheet():
+    obj = torch.zeros(2, 1, 4)
+    obj[1, 0, 1:] = 0.5  # v alone
+    depth = torch.tensor([[[9.0, 3.0, 9.0, torch.inf]]])
+    assert moving_pixels({"obj": obj, "depth": depth}) == 2

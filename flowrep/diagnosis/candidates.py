@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from flowrep.diagnosis.fit import BEHIND_PX, Pairs, gauss_newton, residuals
+from flowrep.diagnosis.fit import Pairs, gauss_newton, residuals
 from flowrep.diagnosis.rivals import Rival
 
 # A fitted factor beyond these, or below their inverse, is no camera's and no unit's.
@@ -51,7 +51,7 @@ def candidate(pairs: Pairs, rival: Rival, motion: Tensor, noise: Tensor) -> Cand
     def cost(n: Tensor) -> float:
         squared = (residuals_of(n.unsqueeze(0)) / noise.unsqueeze(1)).square().sum(2)
         # Depth that is looked up elsewhere is unknown at some pixels: they count as others do.
-        return float(squared.log1p().nanmean(-1).nan_to_num(BEHIND_PX).mean())
+        return float(squared.log1p().nanmean(-1).nan_to_num(math.inf).mean())
 
     starts = [noise.new_tensor(start).expand(count, k) for start in rival.start]
     if not k:

@@ -23,7 +23,7 @@ EYE = torch.eye(4, dtype=torch.float64)
 PIXELS = 500  # that are sampled from each pair
 _FITTED = PIXELS // 2  # of these: motions and numbers are fitted to fewer pixels, to save time
 _LEAST_TEXTURE = 0.25  # of a structure tensor's trace, 0 to 2: with less, flow is a guess
-BEHIND_PX = 1e3  # residual of a point that a motion puts behind the camera
+_BEHIND_PX = 1e3  # residual of a point that a motion puts behind the camera
 _STEP = 1e-6  # of numeric derivatives in float64, in radians, metres, or a change's numbers
 _BEND = 0.02  # share by which inverse depth may differ from the mean of its neighbours
 _NEAREST = 0.15  # share of the pixels whose residuals give a fit's scale: more may move by itself
@@ -183,14 +183,14 @@ def residuals(pairs: Pairs, motion: Tensor) -> Tensor:
     pixel, ratio = seen_before(pairs, motion)
     known = ~pairs.depth.isnan() & motion.isfinite().flatten(-2).all(-1, keepdim=True)
     if pairs.by_flow:
-        px = (pairs.raw - pairs.gain @ (pairs.pixel - pixel)).nan_to_num(nan=BEHIND_PX)
+        px = (pairs.raw - pairs.gain @ (pairs.pixel - pixel)).nan_to_num(nan=_BEHIND_PX)
         return torch.where((known & pairs.raw.isfinite().all(-2)).unsqueeze(-2), px, math.nan)
     share = looked_up(pairs.before, pixel) * pairs.depth * ratio - 1
     # Interpolation averages noise: between pixels, residuals are smaller whatever the motion.
     part = (pixel - 0.5).frac()
     averaged = (part.square() + (1 - part).square()).prod(-2)
     share = share / ((1 + averaged) / 2).sqrt()
-    px = (pairs.focal_px * share / pairs.stretch).masked_fill(ratio.isnan(), BEHIND_PX)
+    px = (pairs.focal_px * share / pairs.stretch).masked_fill(ratio.isnan(), _BEHIND_PX)
     return torch.where(known & pairs.depth.isfinite(), px, math.nan).unsqueeze(-2)
 
 

@@ -181,7 +181,7 @@ class _Case:
         is_bad = poses.is_bad & is_world & (off_px > _NOISE * poses.sigma_px)
         is_bad &= off_px > max(_NOISE * deviation_px, self.rough_px)
         bad = [name for name, is_one in zip(names, is_bad.tolist()) if is_one]
-        many = 0.5 if self.pairs.is_estimated else MANY
+        many = 0.5 if self.pairs.is_estimated else MANY  # an estimate fails in some pairs
         if len(bad) >= max(FEW, many * len(names)):
             why = f"poses of {len(bad)} in {len(names)} pairs don't fit: {', '.join(bad)}"
             if self.pairs.is_estimated:
