@@ -349,7 +349,7 @@ class ForeignFunction:
             given = given.get("action")
         n = int(self._task.action_spec.space.n)
         try:
-            actions = torch.as_tensor(given).cpu()
+            actions = torch.as_tensor(given).double().cpu()  # `isin` takes no bool
         except (TypeError, ValueError, RuntimeError):  # None, for instance
             actions = torch.empty(0)
         if actions.shape != maps.batch_size or not torch.isin(actions, torch.arange(n)).all():
