@@ -59,7 +59,14 @@ def test_beside_a_camera_at_rest_flow_says_nothing_of_its_conventions():
 
 def test_the_recorded_motion_may_be_that_of_fewer_than_half_of_the_pixels():
     assert drawn(30046).moving > 0.55
-    assert found_of(drawn(30046)).is_right
+    found = found_of(drawn(30046))
+    assert found.is_right
+    (share,) = [int(x.split("%")[0]) for x in found.notes if "of pixels don't fit" in x]
+    assert share > 55
+
+
+def test_bodies_whose_motions_leave_little_are_right_although_others_leave_less():
+    assert found_of(drawn(75116)).is_right
 
 
 def test_pairs_in_which_a_body_fills_the_picture_are_no_mistake():
@@ -126,6 +133,13 @@ def test_a_listed_mistake_is_named(name, seed):
 )
 def test_a_mistake_that_nobody_listed_is_noticed(name):
     assert found_of(with_mistake(name)).is_wrong
+
+
+def test_an_offset_that_is_larger_than_depth_is_noticed():
+    # Half of depth plus 16 m, and depth is some 12 m: multiple and offset have to change together.
+    _, found, _ = outcome(drawn(76183), *mistaken(drawn(76183), 76183))
+    assert found.is_wrong
+    assert "depth has an offset" in found.words
 
 
 def test_a_mistake_and_another_that_fits_as_well_are_told_together():

@@ -17,9 +17,7 @@ from flowrep.diagnosis.competition import Competition
 from flowrep.diagnosis.fit import (
     EYE,
     Pairs,
-    flow_of,
     length,
-    median,
     middle,
     residuals,
     seen_before,
@@ -289,12 +287,10 @@ def _bodies(seen: _Seen) -> tuple[str, str]:
     # What a motion moves off its body depends on it in jumps, which no covariance knows.
     pairs, shown = competition.recorded.pairs, competition.recorded.shown
     exact = pictures.mixture(pairs, pairs.motion.unsqueeze(0), competition.noise)
-    best = flow_of(pairs, pictures.best_of(shown))
-    off_px = median(middle(best - flow_of(pairs, pairs.motion)))
-    most_px = poses.most_noise_px(pairs, competition.flow_px)
+    left_px, most_px = found.left_px, poses.most_noise_px(pairs, competition.flow_px)
     gain = explanation.agreed(shown.nats - exact.nats)
-    if gain > max(limits.SURE, 5 * len(bodies)) and off_px > most_px:  # 5 nats for each
-        why = f"another motion, {off_px:.2g} px from theirs, fits their pixels better"
+    if gain > max(limits.SURE, 5 * len(bodies)) and left_px > most_px:  # 5 nats for each
+        why = f"they leave {left_px:.2g} px, and other motions fit better"
         return "fault", f"instance_motion or ids don't fit the bodies: {why}"
     if not found.is_right:
         return "untested", f"motions of bodies are not tested: {found.words}"

@@ -77,6 +77,13 @@ class Explanation:
         is_beside = (share > _BODY) & ~self.poses.is_bad
         return self.pairs.by_flow and int(is_beside.sum()) >= FEW
 
+    @property
+    def own_share(self) -> float:
+        """The share of the known pixels that follow the recorded motion, else the likeliest."""
+        odds, pair = self.shown.odds, torch.arange(len(self.pairs.K))
+        own = self.shown.log_odds.argmax(0) if self.poses is None else self.poses.mode
+        return float(odds[own, pair][~self.pairs.depth.isnan()].mean())
+
     @cached_property
     def systematic_px(self) -> tuple[float, float]:
         """The error that all recorded motions share, and twice its standard deviation."""

@@ -288,8 +288,9 @@ def gauss_newton(
         unit = A.diagonal(dim1=-2, dim2=-1).clamp(min=1e-12).rsqrt()
         A = A * unit.unsqueeze(-1) * unit.unsqueeze(-2) + 1e-6 * torch.eye(k)
         delta = unit * torch.linalg.solve_ex(A, b * unit)[0].nan_to_num()
-        most = 0.5 * n.abs().clamp(min=1.0)
-        n = n - delta.clamp(-most, most)
+        # At most half of a number, or of one, in the same direction.
+        most = 0.5 * n.abs().clamp(min=1.0) / delta.abs().clamp(min=1e-12)
+        n = n - delta * most.amin(-1, keepdim=True).clamp(max=1.0)
     return best, least
 
 

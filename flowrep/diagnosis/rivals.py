@@ -154,8 +154,7 @@ def rivals_of(
         Rival("depth", "depth isn't linear", "depth isn't metres times a unit",
               _depth(lambda z, n: n[:, :1].clamp(1e-3) * z.clamp(1e-6) ** n[:, 1:].clamp(-3.0)),
               ((1.0, 1.0), (1.0, 2.0)), is_vague=True),
-        Rival("depth", "depth plus {0:.3g} m", "depth has an offset",
-              _depth(lambda z, n: (n[:, 1:] * z + n[:, :1]).clamp(min=1e-6)), ((0.0, 1.0),),
+        Rival("depth", "depth plus an offset", "depth has an offset", _with_offset, ((0.0, 1.0),),
               is_vague=True),
     ]  # fmt: skip
     is_z = given["depth_kind"] != "ray_length"
@@ -297,6 +296,12 @@ def _depth(change: Callable[[Tensor, Tensor], Tensor]) -> Change:
         return pairs._replace(depth=depth, before=before, stretch=stretch)
 
     return changed
+
+
+def _with_offset(pairs: Pairs, n: Tensor) -> Pairs:
+    """Adds an offset to a multiple of depth, in units of its median."""
+    unit = pairs.now[pairs.now > 0].median().reciprocal()
+    return _depth(lambda z, n: (n[:, 1:] * z + unit * n[:, :1]).clamp(min=1e-6 * unit))(pairs, n)
 
 
 def _from_buffer(buffer: Tensor, line: Tensor) -> Tensor:

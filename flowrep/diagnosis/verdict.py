@@ -214,7 +214,7 @@ class _Case:
 
     def right(self) -> Diagnosis:
         """Returns the verdict if nothing speaks against the data."""
-        outliers = 1 - float(self.recorded.shown.shares.amax(0).mean())
+        outliers = 1 - self.recorded.own_share
         if outliers > HARMLESS[1] and self.pairs.by_flow:
             note = f"{outliers:.0%} of pixels don't fit: they move, or depth is wrong there"
             self.notes.append(note)
