@@ -159,7 +159,7 @@ def run_in_folder(config: TrainConfig, folder: RunFolder) -> None:
             folder.write_config(runner.config.plain())
         else:
             runner.load()
-            folder.lengthen(config.total_frames)
+            folder.write_total_frames(config.total_frames)
         print(f"run folder: {folder.path}")
         try:
             is_evaluated = train_evaluate_film(runner, stop)

@@ -170,7 +170,7 @@ def test_nothing_in_a_stored_config_is_resolved(tmp_path, monkeypatch):
 WRITES = {
     "metrics.csv": lambda run: run.log_metrics(10, {"alpha": 0.5}),
     "evaluation.csv": lambda run: run.save_episodes([episode(1)]),
-    "machine.json": lambda run: run.note_machine({"cpu": "x"}),
+    "machine.json": lambda run: run.log_machine({"cpu": "x"}),
     "config.yaml": lambda run: run.write_config({"seed": 1}),
     "checkpoint/latest.safetensors": lambda run: save_checkpoint(run.checkpoint_path, {"a": 1}),
 }

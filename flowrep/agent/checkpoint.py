@@ -51,7 +51,7 @@ def save_checkpoint(path: str | os.PathLike[str], state: Mapping[str, Any]) -> N
     path = Path(path)
     tensors: dict[str, Tensor] = {}
     document = _as_json(state, "", tensors)
-    digests = {name: _read(part, tensors.__getitem__)[1] for name, part in document["dict"].items()}
+    digests = {name: _restored(x, tensors.__getitem__)[1] for name, x in document["dict"].items()}
     metadata = {"format": FORMAT, "state": json.dumps(document), "crc32": json.dumps(digests)}
     try:
         with naming(path):
@@ -103,7 +103,7 @@ def load_checkpoint(
                 raise ValueError("its parts are not those that were saved")
             state = {}
             for name in items if parts is None else parts:
-                state[name], digest = _read(items[name], file.get_tensor)
+                state[name], digest = _restored(items[name], file.get_tensor)
                 if digest != digests[name]:
                     raise ValueError(f"{name!r} is not what was saved")
             return state
@@ -139,7 +139,7 @@ def _as_json(value: Any, at: str, tensors: dict[str, Tensor]) -> Any:
     )
 
 
-def _read(part: Any, get_tensor: Callable[[str], Tensor]) -> tuple[Any, int]:
+def _restored(part: Any, get_tensor: Callable[[str], Tensor]) -> tuple[Any, int]:
     """Returns the state of a part, and the CRC-32 of its JSON data and tensors."""
     tensors: list[Tensor] = []
 

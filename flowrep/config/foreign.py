@@ -53,8 +53,8 @@ def _load(source: ConfigSource, load: Any, config_path: str) -> ConfigResult:
     result: ConfigResult = load(source, config_path)
     if not source.full_path().startswith(_OURS) and Path(source.path).resolve() != CONF_DIR:
         name = f"{config_path.removesuffix('.yaml')}.yaml"
-        ours = _plain(OmegaConf.load(CONF_DIR / name)) if (CONF_DIR / name).is_file() else {}
-        content, group = _plain(result.config), config_path.rpartition("/")[0]
+        ours = _as_dict(OmegaConf.load(CONF_DIR / name)) if (CONF_DIR / name).is_file() else {}
+        content, group = _as_dict(result.config), config_path.rpartition("/")[0]
         # What is unchanged in a copy of conf/ is flowrep's.
         if content != ours and (does := _outside(group, result.header["package"], content, ours)):
             raise UsageError(
@@ -64,7 +64,7 @@ def _load(source: ConfigSource, load: Any, config_path: str) -> ConfigResult:
     return result
 
 
-def _plain(config: Any) -> dict[Any, Any]:
+def _as_dict(config: Any) -> dict[Any, Any]:
     plain = OmegaConf.to_container(config)
     return plain if isinstance(plain, dict) else {}
 

@@ -349,8 +349,8 @@ class StreetEnv(gym.Env):
             "speed": list(episode.speed_mps),
             "frame_rate_hz": episode.frame_rate_hz,
             "steps": episode.steps,
-            "now": _plain(episode.now),
-            "before": _plain(episode.before),
+            "now": _data_of(episode.now),
+            "before": _data_of(episode.before),
         }
 
     def _resume(self, state: Mapping[str, Any]) -> None:
@@ -428,5 +428,5 @@ def _number(value: Any) -> float:
         return math.nan
 
 
-def _plain(moment: Moment) -> dict[str, Any]:
+def _data_of(moment: Moment) -> dict[str, Any]:
     return {"vehicle": [float(value) for value in moment.vehicle], "ticks": moment.ticks}

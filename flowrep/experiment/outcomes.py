@@ -30,7 +30,7 @@ OUTCOMES = ("success", "collision", "out_of_bounds", "timeout")
 CAUSES = ("out of bounds", "collision: pedestrian", "collision: other", "timeout")
 
 
-IDENTITY = (
+EPISODE_KEY = (
     "scene", "scene_id", "evaluation", "frames", "policy", "speed", "fps", "episode_seed",
 )  # fmt: skip
 """The columns that tell a run's episodes apart."""

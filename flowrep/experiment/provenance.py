@@ -16,7 +16,7 @@ from flowrep import __version__
 if TYPE_CHECKING:
     import torch
 
-_IDENTITY = (
+_DEFINING_KEYS = (
     "scene", "representations", "flow", "motion", "noise", "algorithm", "speed", "seed", "num_envs",
 )  # fmt: skip
 """The parts of a config that determine the weights after some number of frames."""
@@ -25,7 +25,7 @@ _IDENTITY = (
 def origin_of(config: Mapping[str, Any]) -> dict[str, Any]:
     """Returns the identity of a run: flowrep's version, and the config keys that define it."""
     # Tuples become lists, as they are in a checkpoint that was read.
-    parts = json.loads(json.dumps({key: config[key] for key in _IDENTITY}))
+    parts = json.loads(json.dumps({key: config[key] for key in _DEFINING_KEYS}))
     # It only selects `algorithm.mirror` in presets; the street is the same with and without it.
     parts["scene"].pop("symmetric", None)
     return {"flowrep": __version__, **parts}

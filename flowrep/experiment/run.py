@@ -23,7 +23,7 @@ from flowrep.config.usage import UsageError
 from flowrep.config.yaml_file import read_yaml
 from flowrep.experiment.outcomes import (
     COLUMNS,
-    IDENTITY,
+    EPISODE_KEY,
     OUTCOMES,
     EpisodeRecord,
     read_episodes,
@@ -133,7 +133,7 @@ class RunFolder:
         """Returns the path of the video with this name."""
         return self.path / "videos" / f"{name}.mp4"
 
-    def lengthen(self, total_frames: int) -> None:
+    def write_total_frames(self, total_frames: int) -> None:
         """Writes to a run's config that it is longer, unless it says so already."""
         config = self.read_config()
         if config["total_frames"] != total_frames:
@@ -158,7 +158,7 @@ class RunFolder:
         """Returns the resolved config as its model; see `validated_run` for `trusted`."""
         return validated_run(self.read_config(), str(self.config_path), trusted)
 
-    def note_machine(self, machine: Mapping[str, Any]) -> None:
+    def log_machine(self, machine: Mapping[str, Any]) -> None:
         """Notes in machine.json that a machine works on the run, from `started` to `ended` (UTC).
 
         If the last entry is of this machine, it is made longer.
@@ -247,8 +247,8 @@ class RunFolder:
 
         They go to the end, so that running the same evaluation again results in the same file.
         """
-        identity = itemgetter(*IDENTITY)
+        key_of = itemgetter(*EPISODE_KEY)
         new = [{name: str(cell) for name, cell in each.row().items()} for each in records]
-        again = {identity(row) for row in new}
-        kept = [row for row in self.read_episodes() if identity(row) not in again]
+        again = {key_of(row) for row in new}
+        kept = [row for row in self.read_episodes() if key_of(row) not in again]
         write_rows(self.evaluation_path, [*kept, *new], COLUMNS)

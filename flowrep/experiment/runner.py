@@ -81,7 +81,7 @@ class Runner:
     def train(self, stop: StopRequest) -> None:
         """Trains until `total_frames` or until a stop is requested, and saves the last state."""
         total = self.config.total_frames
-        self.folder.note_machine(self.machine)
+        self.folder.log_machine(self.machine)
         log = Every(self.config.log_every_frames, self.frames)
         evaluate = Every(self.config.evaluation.every_frames, self.frames)
         save = Every(self.config.checkpoint_every_frames, self.frames)
@@ -185,7 +185,7 @@ class Runner:
             return False
         records = evaluation.records(**driver.origin(kind))
         self.folder.log_episodes(records)
-        self.folder.note_machine(self.machine)
+        self.folder.log_machine(self.machine)
         if kind == "final":
             print_results([record.row() for record in records])
         return True
@@ -226,7 +226,7 @@ class Runner:
         self.check()
         with self.clock("checkpoint"):
             save_checkpoint(self.folder.checkpoint_path, self.state())
-        self.folder.note_machine(self.machine)
+        self.folder.log_machine(self.machine)
 
     def load(self) -> None:
         """Continues from the checkpoint and drops the rows logged after it."""

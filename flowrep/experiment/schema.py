@@ -54,7 +54,7 @@ FrameRates = Annotated[list[FrameRate], Field(min_length=1), Distinct]
 BaselineNames = Annotated[list[BaselineName], Distinct]
 
 
-def _named(maps: dict[str, Any]) -> dict[str, Any]:
+def _checked_names(maps: dict[str, Any]) -> dict[str, Any]:
     if not maps or not all(name.isidentifier() for name in maps):
         raise ValueError("choose at least one by its name: representations=[ego,obj]")
     return maps
@@ -67,7 +67,7 @@ def _scene(value: Any) -> Any:
     return load_scene(value)
 
 
-MapOptions = Annotated[dict[str, dict[str, Any]], AfterValidator(_named)]
+MapOptions = Annotated[dict[str, dict[str, Any]], AfterValidator(_checked_names)]
 SceneSection = Annotated[InstanceOf[Scene], BeforeValidator(_scene), PlainSerializer(scene_data)]
 
 

@@ -352,8 +352,8 @@ def _planes(
     rows = [a_y * y + constant for a_y, constant in zip(each[3:6], each[6:9])]
     # Without ids, each term has W or H values instead of H · W.
     if instance is None and torch.compiler.is_compiling():
-        x, *columns = _table(x, *columns)
-        y, *rows = _table(y, *rows)
+        x, *columns = _slices_of_one(x, *columns)
+        y, *rows = _slices_of_one(y, *rows)
     q_far = [column + row for column, row in zip(columns, rows)]
     if isinstance(dt, Tensor):
         dt = dt[..., None, None]
@@ -375,7 +375,7 @@ def _of_pixels(by_motion: Tensor, instance: Tensor) -> list[Tensor]:
         raise
 
 
-def _table(*entries: Tensor) -> tuple[Tensor, ...]:
+def _slices_of_one(*entries: Tensor) -> tuple[Tensor, ...]:
     """Returns the entries as slices of one tensor.
 
     Inductor stores stacked entries. Otherwise it would compute them again at every pixel, which

@@ -260,7 +260,7 @@ class DeclaredRecording(Recording):
             options: Any = {"interpolate": self.interpolate}
             return match_times(times_s, self._times_s, self.tolerance_s, **options)
         else:
-            as_key, key_of = (_plain, _plain) if by == "name" else (float, _number)
+            as_key, key_of = (_bare_name, _bare_name) if by == "name" else (float, _number)
             row_of = {as_key(key): row for row, key in enumerate(keys)}
             if len(keys) != count:
                 raise SequenceError(path, f"has {count} rows, and {len(keys)} {by}s")
@@ -362,7 +362,7 @@ class DeclaredRecording(Recording):
 
     # The frames.
 
-    def _read(self, index: int) -> Frame:
+    def _frame(self, index: int) -> Frame:
         i = int(self._order[index])
         rgb, source = self._picture(i)
         depth = self._stored_depth(i)
@@ -452,7 +452,7 @@ def _number(name: str) -> int:
     return int(digits[0]) if digits else -1
 
 
-def _plain(name: str) -> str:
+def _bare_name(name: str) -> str:
     """Returns a frame's name without folder, suffix and leading zeros: images/007.png is 7."""
     stem = Path(name).stem if Path(name).suffix.lower() in files.PICTURES else Path(name).name
     return stem.lstrip("0") or "0"

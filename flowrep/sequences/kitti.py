@@ -33,7 +33,7 @@ class Kitti(Recording):
             raise SequenceError(self.folder, says)
         self.count = 2 * len(self._pairs)
 
-    def _read(self, index: int) -> Frame:
+    def _frame(self, index: int) -> Frame:
         pair, is_current = self._pairs[index // 2], bool(index % 2)
         name = f"{pair}_{'10' if is_current else '11'}"
         picture = self.folder / "image_2" / f"{name}.png"

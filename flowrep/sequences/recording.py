@@ -99,14 +99,14 @@ class Recording(ABC):
         return self.count
 
     @abstractmethod
-    def _read(self, index: int) -> Frame:
+    def _frame(self, index: int) -> Frame:
         """Returns a frame, unchecked."""
 
     def __getitem__(self, index: int) -> Frame:
         """Returns a frame, after a check that its maps have one size and K is valid."""
         if not 0 <= index < len(self):
             raise IndexError(f"frame {index} of {len(self)}")
-        frame = self._read(index)
+        frame = self._frame(index)
         shapes = {"depth": frame.size}
         shapes |= {} if frame.rgb is None else {"colour": frame.rgb.shape[:2]}
         shapes |= {} if frame.raw is None else {"flow": frame.raw.shape[1:]}

@@ -253,7 +253,7 @@ class RosBag(Recording):
             raise SequenceError(self.path, f"depth is of {depth}, pictures of {colour}: {remedy}")
         return np.linalg.inv(ends[0]) @ ends[1]
 
-    def _read(self, index: int) -> Frame:
+    def _frame(self, index: int) -> Frame:
         stamp, depth_stamp, pose, position = self._moments[index]
         with self._naming():
             rgb: Any = _colour(self._image(self._rgb, stamp), self.path)

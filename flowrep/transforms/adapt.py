@@ -82,7 +82,7 @@ class AdaptDepth(CameraTransform):
     def compute(self, depth: Tensor, K: Tensor | None = None) -> tuple[Tensor]:
         """Returns depth along the optical axis."""
         depth = depth.movedim(-1, -3) if self.channels_last else depth
-        depth = depth.to(base.signed(depth.dtype))
+        depth = depth.to(base.signed_type(depth.dtype))
         return (geometry.adapt_depth(depth, K=self.K if K is None else K, **self.options),)
 
     def output_specs(self, depth: TensorSpec, *camera: TensorSpec) -> tuple[TensorSpec]:
@@ -211,8 +211,8 @@ class AdaptFlow(MapTransform):
         self.options = options
         self.channels_last = channels_last
 
-    def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
-        (flow,) = super()._read(tensordict)
+    def _tensors(self, tensordict: TensorDictBase) -> list[Tensor]:
+        (flow,) = super()._tensors(tensordict)
         if self.channels_last:
             return [flow]
         return [masked_flow(flow, self.in_keys[0], tensordict)]
@@ -268,7 +268,7 @@ class Plane(MapTransform):
 
     def compute(self, picture: Tensor) -> tuple[Tensor]:
         """Returns the map."""
-        picture = picture.to(base.signed(picture.dtype))
+        picture = picture.to(base.signed_type(picture.dtype))
         ids = picture[..., 0] if len(self.reads[0].shape) == 3 else picture
         if self.type is not None:
             kind = picture[..., 1]
@@ -280,7 +280,7 @@ class Plane(MapTransform):
         """Returns an unbounded spec."""
         *batch, height, width = picture.shape[: picture.ndim - len(self.reads[0].shape) + 2]
         shape = (*batch, 1, height, width)
-        return (Unbounded(shape, device=picture.device, dtype=base.signed(picture.dtype)),)
+        return (Unbounded(shape, device=picture.device, dtype=base.signed_type(picture.dtype)),)
 
 
 class BodyRows:

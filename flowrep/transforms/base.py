@@ -158,7 +158,7 @@ class MapTransform(Transform):
                 )
             agreed |= {name: n for name, n in zip(reads.shape, sizes) if isinstance(name, str)}
 
-    def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
+    def _tensors(self, tensordict: TensorDictBase) -> list[Tensor]:
         """Returns the inputs of `compute`; a subclass may check their values."""
         return self._with_signed_ids(self._inputs(tensordict))
 
@@ -172,7 +172,7 @@ class MapTransform(Transform):
         lacks = (next_tensordict.get(key, None) is None for key in self.in_keys)
         if self.missing_tolerance and any(lacks):
             return next_tensordict
-        maps = self._read(next_tensordict)
+        maps = self._tensors(next_tensordict)
         # The class's function, not the bound method: compiled once for all instances, which stay
         # picklable.
         compute = type(self).compute
@@ -293,7 +293,7 @@ class MapTransform(Transform):
 def _outermost(transform: Any) -> Any:
     """Returns the env that holds a transform or, without one, its outermost Compose."""
     # `container` raises in a Compose that is in no env, as gymnasium's wrapper has one.
-    while (held := transform.__dict__.get("_container")) and (holder := held()) is not None:
+    while (weak := transform.__dict__.get("_container")) and (holder := weak()) is not None:
         transform = holder
     return transform
 
@@ -324,7 +324,7 @@ class RecurrentTransform(MapTransform):
         """Returns the outputs from the previous step's `carried_keys` and the current inputs."""
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        now, before = self._read(next_tensordict), self._carried(tensordict)
+        now, before = self._tensors(next_tensordict), self._carried(tensordict)
         if self.carried_keys == self.in_keys:
             for key, then, value in zip(self.in_keys, before, now):
                 check_unconverted(key, then, value)
@@ -379,7 +379,7 @@ class RecurrentTransform(MapTransform):
                     f"{int(steps.max())} steps ahead ('steps_to_next_obs'). Store {lost} as the "
                     "env gave it, before MultiStepTransform moves it"
                 )
-            later = self.advance(self._carried(tensordict), self._read(following))
+            later = self.advance(self._carried(tensordict), self._tensors(following))
             for key, value in zip(self.out_keys, later):
                 if key in missing:
                     following.set(key, value)
@@ -390,7 +390,7 @@ class RecurrentTransform(MapTransform):
         self, tensordict: TensorDictBase, missing: NestedKey
     ) -> dict[NestedKey, Tensor]:
         """Returns the outputs at each step of a trajectory, as the env would have given them."""
-        now, done = self._read(tensordict), tensordict.get(("next", "done"), None)
+        now, done = self._tensors(tensordict), tensordict.get(("next", "done"), None)
         if done is None or "time" not in tensordict.names:
             raise MissingKey(
                 f"{missing!r} is not in the batch, nor is the previous step it depends on: store "
@@ -509,7 +509,7 @@ def has_values(x: Tensor) -> bool:
     return not (x.is_meta or torch.compiler.is_compiling())
 
 
-def signed(dtype: torch.dtype) -> torch.dtype:
+def signed_type(dtype: torch.dtype) -> torch.dtype:
     """Returns int64 for the unsigned types for which PyTorch lacks most functions."""
     return torch.int64 if dtype in _UNSIGNED else dtype
 

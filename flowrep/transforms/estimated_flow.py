@@ -28,7 +28,7 @@ PICTURE_PAIR = Reads((6, "kH", "kW"), "integer")
 # than 0.9 of what ego flow leaves, and by more than rounding to grey levels could. With 0.7, false
 # object flow above 0.3 px was 8 % rarer, but people 8 to 20 m ahead lost another 4 percentage
 # points of their flow.
-_CLEARLY, _GREY_LEVELS = 0.9, 2.0
+_MISFIT_SHARE, _ROUNDING_GREY_LEVELS = 0.9, 2.0
 
 # Takes two uint8 [N, 3, H, W], returns the flow from the first to the second, float [N, 2, H, W].
 Estimator = Callable[[Tensor, Tensor], Tensor]
@@ -336,7 +336,7 @@ class EstimatedFlow(FlowTransform):
         beyond = estimate + _sampled(smooth, moved) - smooth
         # Without texture, and where something has just come into view, an estimate is a guess.
         misfit = _misfit(current, _sampled(warped, moved))
-        is_moving = misfit < _CLEARLY * _misfit(current, warped) - _GREY_LEVELS**2
+        is_moving = misfit < _MISFIT_SHARE * _misfit(current, warped) - _ROUNDING_GREY_LEVELS**2
         is_moving &= (sources.abs() <= 1).all(-1).unsqueeze(1)  # the previous picture showed it
         # An estimate that isn't finite is kept, so that the mask can say so.
         beyond = torch.where(is_moving | ~estimate.isfinite(), beyond, 0.0)

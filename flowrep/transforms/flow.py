@@ -114,8 +114,8 @@ class CameraTransform(MapTransform):
                 size = _map_size(maps, self.reads)
                 geometry.check_intrinsics(f"key {key!r}", K, size, allow_unknown=True)
 
-    def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
-        maps = super()._read(tensordict)
+    def _tensors(self, tensordict: TensorDictBase) -> list[Tensor]:
+        maps = super()._tensors(tensordict)
         if self.reads[0] != base.FLOW:
             return maps
         return [masked_flow(maps[0], self.in_keys[0], tensordict), *maps[1:]]

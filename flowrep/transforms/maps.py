@@ -21,7 +21,7 @@ from flowrep.transforms.base import (
     MapTransform,
     check_distinct_keys,
     has_values,
-    signed,
+    signed_type,
 )
 
 Encoding = Literal["ids", "onehot"]
@@ -50,8 +50,8 @@ class Rgb(MapTransform):
     def __init__(self, *, in_keys: Keys = ("sensor", "rgb"), out_keys: Keys = "rgb") -> None:
         super().__init__([RGB], in_keys, out_keys)
 
-    def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
-        (rgb,) = super()._read(tensordict)
+    def _tensors(self, tensordict: TensorDictBase) -> list[Tensor]:
+        (rgb,) = super()._tensors(tensordict)
         _check_bytes(rgb, f"{self.in_keys[0]!r} holds values", "divide pictures of 16 bits by 257")
         return [rgb]
 
@@ -109,8 +109,8 @@ class Segmentation(MapTransform):
         self.num_classes = checked_count("num_classes", num_classes, most=256)  # ids are uint8
         self.encoding = encoding
 
-    def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
-        (ids,) = super()._read(tensordict)
+    def _tensors(self, tensordict: TensorDictBase) -> list[Tensor]:
+        (ids,) = super()._tensors(tensordict)
         if self.encoding == "ids":
             remedy = (
                 "give pixels without a class an id in that range, e.g. "
@@ -254,7 +254,7 @@ class InstanceIds(MapTransform):
         self._calls_to_skip -= 1
         if self._calls_to_skip < 0:
             self._calls_to_skip = _CALLS_PER_LOOK - 1 if ids.is_cuda else 0
-            ids = ids.to(signed(ids.dtype))
+            ids = ids.to(signed_type(ids.dtype))
             self._name_ids_without_row(ids, next_tensordict[self.out_keys[0]])
         return next_tensordict
 
@@ -272,10 +272,10 @@ class InstanceIds(MapTransform):
             if links:
                 raise ValueError(
                     f"{self.in_keys[0]!r} holds PyBullet's ids with links, for instance "
-                    f"{_named(links[0])}, but body_ids lists bodies without links: list (body, "
+                    f"{_id_text(links[0])}, but body_ids lists bodies without links: list (body, "
                     "link) for each link with a pose, -1 for the base, or set links_as_body=True"
                 )
-        shares = [f"{_named(n)} ({count / ids.numel():.1%})" for n, count in zip(numbers, counts)]
+        shares = [f"{_id_text(n)} ({count / ids.numel():.1%})" for n, count in zip(numbers, counts)]
         warnings.warn(
             f"{self.in_keys[0]!r}: ids without a row count as the static world: "
             f"{', '.join(shares[:8])} of the pixels{', ...' * (len(shares) > 8)}. If they move, "
@@ -317,6 +317,6 @@ def _body_of(ids: Tensor) -> Tensor:
     return torch.where(ids < 0, ids, ids % (1 << _LINK_BIT)) if ids.element_size() > 2 else ids
 
 
-def _named(number: int) -> str:
+def _id_text(number: int) -> str:
     link, body = divmod(number, 1 << _LINK_BIT)
     return f"{number} = body {body}, link {link - 1}" if link else str(number)

@@ -147,8 +147,8 @@ class SensorNoise(MapTransform):
             state[0] = torch.randint(2**62, ())
         self.register_buffer("drawn_and_calls", state)
 
-    def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
-        maps = super()._read(tensordict)
+    def _tensors(self, tensordict: TensorDictBase) -> list[Tensor]:
+        maps = super()._tensors(tensordict)
         for i, (sensor, key) in enumerate(zip(self.sensors, self.in_keys)):
             if sensor == "flow" and self.out_keys[i] != key:  # the mask lies beside the read key
                 maps[i] = masked_flow(maps[i], key, tensordict)

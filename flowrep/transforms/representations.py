@@ -177,8 +177,8 @@ def representation_stack(
     transforms += foreign.values()
     written = dict.fromkeys(key for transform in transforms for key in transform.out_keys)
     shown = {*named, *_KEPT, *(key for each in foreign.values() for key in each.out_keys)}
-    hidden = [key for key in written if key not in shown]
-    return Compose(*transforms, *([DropKeys(*hidden)] if hidden else []))
+    intermediate = [key for key in written if key not in shown]
+    return Compose(*transforms, *([DropKeys(*intermediate)] if intermediate else []))
 
 
 class DropKeys(ExcludeTransform):

@@ -44,7 +44,7 @@ def test_a_run_whose_folder_is_moved_begins_no_other_one(tmp_path):
     run = RunFolder(tmp_path / "run")
     with run.locked():
         run.path.rename(tmp_path / "moved")
-        for write in (lambda: run.note_machine({}), lambda: run.save_episodes([episode(2)])):
+        for write in (lambda: run.log_machine({}), lambda: run.save_episodes([episode(2)])):
             with pytest.raises(OSError, match="run/"):
                 write()
     assert not run.path.exists()
@@ -114,7 +114,7 @@ def test_config_comes_back_as_written(tmp_path):
     config = composed("seed=3", "debug=smoke")
     run.write_config(config.plain())
     assert RunFolder.existing(tmp_path).config() == config
-    run.lengthen(512)
+    run.write_total_frames(512)
     assert run.read_config() == config.plain() | {"total_frames": 512}
 
 
@@ -135,7 +135,7 @@ def test_a_run_notes_each_machine_with_its_first_start_and_its_last_end(tmp_path
         now = SimpleNamespace(now=lambda _: datetime(2026, 1, 1, next(clock), tzinfo=UTC))
         patched.setattr("flowrep.experiment.run.datetime", now)
         for machine in (here, here, here | {"cpu": "another"}, here):
-            run.note_machine(machine)
+            run.log_machine(machine)
     noted = json.loads((tmp_path / "machine.json").read_text())
     times = [tuple(each.pop(k)[11:] for k in ("started", "ended")) for each in noted]
     assert noted == [here, here | {"cpu": "another"}, here]

@@ -129,7 +129,7 @@ class Walk(sequences.Recording):
 
     count = 41
 
-    def _read(self, index):
+    def _frame(self, index):
         return frame(str(index), world_from_cam=moved(0.1 * index), rgb=None)
 
 
