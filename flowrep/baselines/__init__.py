@@ -11,9 +11,9 @@ from flowrep.baselines.planner import Planner
 from flowrep.envs import StreetEnv, street_envs
 from flowrep.scenes.vehicle import NO_OP, YAW_SIGN
 
-__all__ = ["BASELINES", "BaselinePolicy", "Driver", "Planner", "RandomActions", "never_turn"]
+__all__ = ["BASELINES", "Baseline", "BaselinePolicy", "Planner", "RandomActions", "never_turn"]
 
-Driver = Callable[[StreetEnv], int]
+Baseline = Callable[[StreetEnv], int]
 """Returns the next action; may read the env's whole state."""
 
 
@@ -36,7 +36,7 @@ class RandomActions:
         return int(self._rng.integers(len(YAW_SIGN)))
 
 
-BASELINES: dict[str, Callable[[], Driver]] = {
+BASELINES: dict[str, Callable[[], Baseline]] = {
     "planner": Planner,
     # It tries wide margins first, because people won't be where it expects them.
     "speed_blind": lambda: Planner((100,), (1.0, 0.5, 0.1), sees_speed=False),

@@ -29,7 +29,7 @@ VectorFactory = Callable[[Sequence[EnvFactory]], SyncVectorEnv]
 
 _SIDE_BY_SIDE = partial(SyncVectorEnv, copy=False, autoreset_mode=AutoresetMode.DISABLED)
 
-
+ENVS_PER_WORKER = 24  # in an evaluation: fewer aren't worth starting a process
 PATIENCE_S = 300.0
 """How long a worker may take to answer: it starts in seconds and steps in milliseconds, but the
 machine may be busy."""

@@ -18,11 +18,9 @@ from flowrep.config.options import validated
 from flowrep.config.usage import UsageError
 from flowrep.envs import make_env, make_mirror
 from flowrep.envs.torchrl_env import usable_device
-from flowrep.envs.workers import available_cores, sheltered, worker_count
+from flowrep.envs.workers import ENVS_PER_WORKER, available_cores, sheltered, worker_count
 from flowrep.experiment.schema import EnvConfig, TrainConfig
 from flowrep.transforms import representation_stack
-
-ENVS_PER_WORKER = 24  # in an evaluation: fewer aren't worth starting a process
 
 
 def device(name: str) -> torch.device:

@@ -29,7 +29,6 @@ OUTCOMES = ("success", "collision", "out_of_bounds", "timeout")
 
 CAUSES = ("out of bounds", "collision: pedestrian", "collision: other", "timeout")
 
-
 EPISODE_KEY = (
     "scene", "scene_id", "evaluation", "frames", "policy", "speed", "fps", "episode_seed",
 )  # fmt: skip

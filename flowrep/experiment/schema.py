@@ -223,6 +223,7 @@ class EvaluateConfig(Command):
             raise ValueError(f"scene needs a value for policy={others[0]}")
         maps = (self.representations or {}).values()
         for key in ("representations", "flow", "motion", "noise", "output"):
+            # `_target_` alone is no map: it trusts a class that a run names.
             if key == "representations" and all(options.keys() == {"_target_"} for options in maps):
                 continue
             if not others and getattr(self, key) is not None:

@@ -204,10 +204,10 @@ def check_intrinsics(
     wrong = ~_fits(*K.float().flatten(-2).unbind(-1), size=size) & ~unknown
     if bool(wrong.any()):
         where, index = first_wrong(name, wrong)
-        check_size(where, K[index].tolist(), size)
+        check_fit(where, K[index].tolist(), size)
 
 
-def check_size(name: str, K: Sequence[Sequence[float]], size: tuple[int, int]) -> None:
+def check_fit(name: str, K: Sequence[Sequence[float]], size: tuple[int, int]) -> None:
     """Checks that the rows of one K, as numbers, fit pictures of `size`; see `check_intrinsics`.
 
     Compiled code can do it, as it reads no tensor.

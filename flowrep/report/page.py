@@ -14,6 +14,7 @@ from flowrep.report.tables import listed
 
 TEMPLATES = Environment(
     loader=FileSystemLoader(Path(__file__).parent),
+    # The page is HTML; the paper's, which is Markdown, must keep its "<" and "&".
     autoescape=lambda name: name is not None and name.endswith(".html.jinja"),
     undefined=StrictUndefined,
     trim_blocks=True,

@@ -102,7 +102,7 @@ class CameraTransform(MapTransform):
     def _check_layout(self, batch: torch.Size, maps: Sequence[Any]) -> None:
         super()._check_layout(batch, maps)
         if self._rows is not None:
-            geometry.camera.check_size("intrinsics", self._rows, _map_size(maps, self.reads))
+            geometry.camera.check_fit("intrinsics", self._rows, _map_size(maps, self.reads))
 
     def _check_values(self, tensordict: TensorDictBase, *, waits: bool = False) -> None:
         lacks = (tensordict.get(key, None) is None for key in self.in_keys)
