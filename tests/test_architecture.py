@@ -1,4 +1,4 @@
-"""Imports point one way: commands → config → experiment → envs → simulator → scenes, and so on."""
+"""Imports point one way: commands → experiment → envs → simulator → scenes → config, and so on."""
 
 import ast
 import sys
@@ -19,21 +19,19 @@ FLOWREP_IMPORTS_ALLOWED = {
     "agent": {"agent", "extras", "files", "config"},
     "files": set(),
     "scenes": {"scenes", "config", "extras"},
-    "simulator": {"simulator", "scenes", "extras", "config"},
+    "simulator": {"simulator", "scenes", "extras"},
     "envs": {"envs", "simulator", "scenes", "transforms", "geometry", "extras"}
     | {"progress", "config"},
     "pybullet": {"simulator", "extras"},
     "baselines": {"baselines", "envs", "scenes"},
-    "experiment": {"experiment", "baselines", "envs", "simulator", "scenes", "agent"}
-    | {"transforms", "geometry", "progress", "config", "extras", "viz"}
-    | {"files"},
+    "experiment": {"experiment", "baselines", "envs", "scenes", "agent", "transforms"}
+    | {"progress", "config", "viz", "files"},
     "progress": set(),
-    "viz": {"viz", "scenes", "geometry", "files"},
+    "viz": {"viz", "scenes", "files"},
     "sequences": {"sequences", "config", "progress", "files", "extras"}
     | {"transforms", "geometry", "viz", "diagnosis"},
     "config": {"config"},
-    "report": {"report", "viz", "config", "experiment", "agent", "envs", "scenes"}
-    | {"extras", "files"},
+    "report": {"report", "config", "experiment", "extras", "files"},
 }
 THIRD_PARTY_ONLY_IN = {
     "pybullet": {"simulator/bullet.py", "pybullet.py"},
