@@ -31,7 +31,7 @@ def load(name, path):
 
 
 @pytest.mark.parametrize(("path", "says"), MODULES.items(), ids=list(MODULES))
-def test_an_import_names_the_extra(path, says, monkeypatch):
+def test_a_missing_package_is_named_with_the_extra_that_installs_it(path, says, monkeypatch):
     monkeypatch.setattr(extras, "find_spec", lambda name: None)
     monkeypatch.setattr(extras.sys, "version_info", (3, 13, 0))
     with pytest.raises(ImportError) as caught:

@@ -157,7 +157,7 @@ def test_a_signal_keeps_the_frames_that_are_done(
         factorize(tmp_path, "flow=exact")
 
 
-def test_a_job_that_was_killed_before_its_first_frame_is_in_nobodys_way(tmp_path):
+def test_the_folder_of_a_job_killed_before_its_first_frame_is_used_again(tmp_path):
     partial = tmp_path / "out.partial"
     partial.mkdir()
     (partial / "job.json").write_text("{}")
@@ -203,7 +203,7 @@ def test_an_estimated_trajectory_begins_with_the_recorded_pose(moments, tmp_path
         np.testing.assert_allclose(line[1:4], moment.world_from_cam[:3, 3], atol=2e-3)
 
 
-def test_a_mask_says_what_is_unknown(moments, tmp_path):
+def test_a_mask_of_moving_pixels_is_grey_where_flow_is_unknown(moments, tmp_path):
     flow = moments[1].raw.copy()
     flow[:, 3, 4] = np.nan
     synthetic.put(tmp_path / "in/flow/0001.flo", flow)
@@ -317,7 +317,7 @@ def run(monkeypatch, *arguments) -> int:
     return ended.value.code
 
 
-def test_a_file_that_is_typed_has_to_be_there(moments, tmp_path, monkeypatch, capsys):
+def test_a_missing_file_that_is_typed_is_refused(moments, tmp_path, monkeypatch, capsys):
     where = [f"input={tmp_path / 'in'}", f"output={tmp_path / 'out'}", "format=frames"]
     assert run(monkeypatch, *where, "format.times=times.txt", "flow=exact") == 2
     assert "error: format.times: there is no file" in capsys.readouterr().err

@@ -181,7 +181,7 @@ def test_a_claim_of_equality_shows_the_p_of_what_its_effect_suggests():
     assert within.split()[-4:] == ["=", "0.037", "(within", "±5)"]
 
 
-def test_what_contradicts_is_corrected_with_the_others():
+def test_p_against_a_claim_is_corrected_as_p_for_it_is():
     asked = HIGH | {"expect": "equal", "margin": 0.05}
     claim = {"claim": "c", "contrasts": [asked], "limits": ""}
     primary, (other,) = claims(
@@ -262,7 +262,7 @@ def test_beside_held_out_speeds_stand_those_of_training_and_what_is_lost_between
     assert "|H2|−29 [" in results.beside_table([first, second])
 
 
-def test_a_claim_is_told_without_the_seed_and_the_panel_that_matter_most_and_seed_by_seed():
+def test_sensitivity_leaves_out_the_seed_and_the_panel_that_matter_most_and_pairs_seeds():
     cells = held_out_cells(HELD_OUT, held_out_runs({"ego+obj": (6, 7, 2), "raw": (2, 3, 1)}))
     asked = {"first": "ego+obj", "second": "raw", "expect": "more"}
     seed, panel, paired, _ = sensitivity(asked, cells).items()

@@ -123,7 +123,7 @@ def loaded(path, *parts):
         return None
 
 
-def test_a_bit_that_flips_anywhere_is_harmless(tmp_path):
+def test_a_flipped_bit_is_noticed_or_changes_nothing(tmp_path):
     path = tmp_path / "c.safetensors"
     state = STATE | {"half": torch.ones(2).bfloat16(), "frames": 1234, "rate": 0.5, "none": None}
     save_checkpoint(path, state)
@@ -139,7 +139,7 @@ def test_a_bit_that_flips_anywhere_is_harmless(tmp_path):
         assert loaded(path) is None, bit
 
 
-def test_a_part_is_checked_alone(tmp_path):
+def test_a_damaged_part_does_not_keep_others_from_being_read(tmp_path):
     """An agent is read without the gigabytes of a replay memory."""
     path = tmp_path / "c.safetensors"
     memory, weight = (torch.full((50,), n, dtype=torch.uint8) for n in (7, 9))

@@ -172,7 +172,7 @@ OTHERS = ["preset", "experiment", "representations", ""]
 @pytest.mark.parametrize(
     ("group", "slip"), [*(("scene", slip) for slip in SLIPS), *((g, "a tab") for g in OTHERS)]
 )
-def test_a_slip_in_a_file_of_ones_own_names_file_and_line(run, tmp_path, group, slip):
+def test_a_mistake_in_a_users_file_is_named_with_file_and_line(run, tmp_path, group, slip):
     text, number = SLIPS[slip]
     file = tmp_path / "conf" / group / "mine.yaml"
     file.parent.mkdir(parents=True)
@@ -214,7 +214,7 @@ def test_a_file_that_hydra_finds_in_conf_first_is_named(run, tmp_path):
         assert f"error: {mine}" in said.err
 
 
-def test_a_folder_of_ones_own_may_hold_other_projects_files_or_stand_for_conf(run, tmp_path):
+def test_a_config_dir_may_hold_files_of_other_projects_or_a_copy_of_conf(run, tmp_path):
     (tmp_path / "scene").mkdir()
     (tmp_path / "train.yaml").write_text("lr: 3\n")
     own = (CONF_DIR / "scene" / "s_turn.yaml").read_text().replace("name: s_turn", "name: alley", 1)

@@ -97,7 +97,7 @@ def test_a_reset_mask_of_false_resets_no_street_and_no_mask_resets_all(make):
         *(({"device": it}, rf"device={it} .*device=cpu$") for it in ("cuda:93", "gpu", 2.5)),
     ],
 )
-def test_an_argument_that_can_not_be_is_refused_by_its_name(arguments, message):
+def test_an_invalid_argument_is_refused_by_its_name(arguments, message):
     with pytest.raises(ValueError, match=f"^{message}"):
         make_env("straight_road", **arguments)
 

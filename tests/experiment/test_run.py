@@ -40,7 +40,7 @@ def test_a_folder_has_one_process_and_one_that_was_killed_holds_it_no_more(tmp_p
             pass
 
 
-def test_a_run_whose_folder_is_moved_begins_no_other_one(tmp_path):
+def test_nothing_is_written_once_a_runs_folder_was_moved(tmp_path):
     run = RunFolder(tmp_path / "run")
     with run.locked():
         run.path.rename(tmp_path / "moved")

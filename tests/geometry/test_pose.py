@@ -149,7 +149,7 @@ LEFT_HANDED = {
 
 
 @pytest.mark.parametrize("axes", LEFT_HANDED)
-def test_a_camera_of_a_left_handed_world_moves_as_it_did(axes):
+def test_poses_of_a_left_handed_world_give_the_same_motion(axes):
     prev_from_curr = torch.tensor([*LEFT_HANDED[axes], [0, 0, 0, 1]], dtype=torch.float64)
     world_from_prev = rigid((0.4, -1.1, 0.7), (30.0, -20.0, 5.0))
     poses = [world_from_prev, world_from_prev @ prev_from_curr]

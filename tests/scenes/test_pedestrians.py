@@ -51,7 +51,7 @@ def test_people_walk_to_and_fro_on_schedule(crowd, time_s, expected):
     np.testing.assert_allclose(crowd.poses(time_s)[:, :2], expected, atol=1e-12)
 
 
-def test_a_crowd_of_one_speed_is_where_everyone_was_and_walks_on_the_same_way(crowd):
+def test_a_change_of_speed_keeps_everyones_position_and_direction(crowd):
     # At 4 s, A is 4 m out and B, 1 m past its turn, on its way back. At 0.5 m/s for 2 s more each
     # is a metre further; at their true speeds A would be at 6 m and B round its corner.
     slower = crowd.all_walking_at(0.5, 4.0)

@@ -23,7 +23,7 @@ def shifted(x=0.0, y=0.0, z=0.0):
     return colour_from_depth
 
 
-def test_the_same_camera_keeps_its_depth():
+def test_registration_to_the_same_camera_changes_no_depth():
     depth = np.random.default_rng(0).uniform(1, 5, SIZE).astype(np.float32)
     depth[3, 4], depth[5, 6] = np.nan, np.inf
     same = Registration(K_DEPTH, K_DEPTH, np.eye(4), SIZE)(depth)

@@ -341,7 +341,7 @@ def test_times_are_a_number_a_row(rows, count, moments, tmp_path):
 
 
 @pytest.mark.parametrize("option", ["poses", "times", "flow", "flow_mask"])
-def test_a_file_that_is_named_has_to_be_there(option, moments, tmp_path):
+def test_a_missing_file_named_by_an_option_is_refused(option, moments, tmp_path):
     for name in ("nothing.txt", None):
         (tmp_path / "timestamps.txt").unlink(missing_ok=True)  # which only the format names
         if name is None:

@@ -102,7 +102,7 @@ def test_without_poses_the_motion_is_estimated():
     assert float(row["recorded_obj_median_px"]) > 1 > float(row["obj_median_px"])
 
 
-def test_an_autofocus_moves_nothing():
+def test_a_change_of_focal_length_causes_no_object_flow():
     # fx from 1455.07 to 1459.04 within 33 ms, of a camera that stands still: pixel u was nearer to
     # the axis before, at (u - cx) 1455.07 / 1459.04 + cx. Pictures are smaller here by 1 / 20.
     before, now = (np.diag([f / 30, f / 30, 1]) @ K for f in (1455.07 / 20, 1459.04 / 20))
@@ -117,7 +117,7 @@ def test_an_autofocus_moves_nothing():
     np.testing.assert_allclose(motion.prev_from_curr, np.eye(4), atol=1e-4)
 
 
-def test_a_motion_that_nothing_tells_leaves_flow_unknown():
+def test_without_known_flow_the_motion_and_ego_flow_are_unknown():
     nothing = np.full((2, 40, 60), np.nan, np.float32)
     motion = sequences.estimated_motion(frame("a"), frame("b"), nothing)
     assert not motion.known

@@ -171,7 +171,7 @@ def test_a_picture_without_depth_of_its_own_is_left_out(tmp_path):
     assert any(note.startswith("1 of 3") for note in recording.notes)
 
 
-def test_transforms_in_a_circle_end(tmp_path):
+def test_a_circle_of_tf_frames_is_followed_once(tmp_path):
     bag = Bag("ros1", tmp_path)
     with bag.writer:
         bag.info("/color/camera_info", "a")

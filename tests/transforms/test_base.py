@@ -117,7 +117,7 @@ def test_a_map_without_channels_is_refused(batch):
         stack.transform_observation_spec(spec)
 
 
-def test_a_map_may_have_a_batch_of_its_own():
+def test_maps_may_have_more_batch_dims_than_their_tensordict():
     cameras = TensorDict({"depth": torch.ones(2, 3, 1, 5, 7)}, [2])
     assert T.Depth(in_keys="depth", out_keys="near")(cameras)["near"].shape == (2, 3, 1, 5, 7)
 

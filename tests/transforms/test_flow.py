@@ -330,7 +330,7 @@ READERS = {
 
 
 @pytest.mark.parametrize("make", READERS.values(), ids=list(READERS))
-def test_a_k_under_a_key_needs_the_previous_frames_k_or_the_word_that_it_never_changes(make):
+def test_k_under_a_key_is_refused_without_prev_intrinsics(make):
     key = ("sensor", "K")
     with pytest.raises(ValueError, match=r"'K'\).*prev_intrinsics=.*PreviousIntrinsics"):
         make(intrinsics=key)

@@ -36,7 +36,7 @@ def rollout(representations) -> torch.Tensor:
         (["rgb"], "Rgb"),
     ],
 )
-def test_each_thing_is_computed_once(representations, expected):
+def test_a_stack_has_no_transform_twice(representations, expected):
     assert [type(each).__name__ for each in stack(representations)] == expected.split()
 
 
