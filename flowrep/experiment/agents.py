@@ -152,6 +152,7 @@ class Agent(Driver):
         if Path(path).suffix != ".safetensors":
             raise UsageError(f"save to a file whose name ends in .safetensors, not to '{path}'")
         weights = dict(self.policy.state_dict())  # type: ignore[attr-defined]
+        # Wherever it drives now, what it learnt is of the scene of its training.
         config = self.config.model_copy(update={"scene": self.trained_in or self.config.scene})
         state = {"frames": self.frames, "config": config.plain()}
         save_checkpoint(path, state | {"policy": packed(weights) if small else weights})

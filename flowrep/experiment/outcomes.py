@@ -147,6 +147,7 @@ def failure_causes(rows: Iterable[Mapping[str, Any]]) -> Counter[str]:
         cause = row["outcome"].replace("_", " ")
         if cause == "collision":
             cause += ": pedestrian" if row["hit"] == "pedestrian" else ": other"
+        # Adds 0 for a success, which is then no part of the total.
         causes[cause] += cause != "success"
     return causes
 
@@ -178,13 +179,9 @@ def print_table(title: str, rows: Sequence[Mapping[str, Any]], least_width: int 
     for name in rows[0]:
         heading = name.replace("_", " ").replace(": ", ":\n")
         is_number = all(str(row[name])[:1] in "-+−<0123456789" for row in rows)
+        side: Any = "right" if is_number else "left"
         # A policy's name may be a long path: it is folded, numbers are not.
-        table.add_column(
-            heading,
-            no_wrap=name != "policy",
-            overflow="fold",
-            justify="right" if is_number else "left",
-        )
+        table.add_column(heading, justify=side, no_wrap=name != "policy", overflow="fold")
     for row in rows:
         table.add_row(*map(str, row.values()))
     # Names are text: a[b] is no markup, :car: no emoji.

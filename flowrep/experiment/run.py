@@ -248,6 +248,7 @@ class RunFolder:
         They go to the end, so that running the same evaluation again results in the same file.
         """
         key_of = itemgetter(*EPISODE_KEY)
+        # As text, as a table's rows are read, so that both have the same keys.
         new = [{name: str(cell) for name, cell in each.row().items()} for each in records]
         again = {key_of(row) for row in new}
         kept = [row for row in self.read_episodes() if key_of(row) not in again]

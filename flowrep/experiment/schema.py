@@ -68,6 +68,7 @@ def _scene(value: Any) -> Any:
 
 
 MapOptions = Annotated[dict[str, dict[str, Any]], AfterValidator(_checked_names)]
+# Written out in stored configs, as a scene's file may change or be somebody else's.
 SceneSection = Annotated[InstanceOf[Scene], BeforeValidator(_scene), PlainSerializer(scene_data)]
 
 
