@@ -17,7 +17,6 @@ from flowrep.experiment.film import Film
 from flowrep.experiment.run import RunFolder
 from flowrep.experiment.schema import EvaluateConfig
 from flowrep.geometry import ego_flow
-from flowrep.train import resumed
 from tests.config.composing import composed, plain
 from tests.running import ROOT, run_here
 
@@ -96,26 +95,14 @@ def test_options_reach_a_users_map_which_checks_them(config):
         build.env(config.model_copy(update={"representations": no_transform}))
 
 
-def command(model, name, *typed):
-    return validated(model, plain(name, *typed))
-
-
-def stored_config(run, *typed):
-    """What a resumed run has for its config."""
-    asked = composed("debug=smoke", f"resume={run.path}", *typed)
-    return resumed(asked, run, [f"resume={run.path}", *typed])
-
-
-def test_a_class_that_the_user_types_again_is_used(config, folder):
+def test_a_trusted_map_keeps_its_options_and_takes_no_others(config, folder):
     run = RunFolder(folder / "run")
     run.write_config(config.plain())
-    assert stored_config(run, TYPED).representations == config.representations
-    asked = command(EvaluateConfig, "evaluate", "run=x", TYPED)
-    assert run.config(asked.trusted).representations == config.representations
     target = TYPED.partition("=")[2]
     assert run.config(target).representations == config.representations  # one without a list
+    typed = ["run=x", TYPED, "+representations.contact.steps=1.0"]
     with pytest.raises(UsageError, match="representations="):
-        command(EvaluateConfig, "evaluate", "run=x", TYPED, "+representations.contact.steps=1.0")
+        validated(EvaluateConfig, plain("evaluate", *typed))
 
 
 def test_a_stored_representation_of_flowreps_names_no_code(config, folder):
