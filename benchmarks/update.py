@@ -27,7 +27,7 @@ from torchrl.objectives import DiscreteSACLoss, SoftUpdate
 
 from flowrep.agent import DiscreteSAC, keep_freed_memory
 from flowrep.agent.cuda_graph import WARM_UP
-from flowrep.agent.observation import has_bf16
+from flowrep.agent.precision import has_bf16
 from flowrep.config.algorithms import DiscreteSACOptions
 
 MAPS = ("ego", "obj")

@@ -12,7 +12,7 @@ from pydantic import create_model
 from torchrl.envs import EnvBase, InitTracker, Transform
 
 from flowrep.agent import Algorithm
-from flowrep.agent.observation import resolved_precision
+from flowrep.agent.precision import resolved_precision
 from flowrep.config.algorithms import ALGORITHMS, AlgorithmOptions
 from flowrep.config.options import validated
 from flowrep.config.usage import UsageError

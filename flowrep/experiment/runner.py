@@ -23,7 +23,7 @@ from flowrep.agent import (
     save_checkpoint,
     torch_threads,
 )
-from flowrep.agent.observation import compute_dtype, has_bf16
+from flowrep.agent.precision import compute_dtype, has_bf16
 from flowrep.envs import WorkerError, begin_step, get_states, has_spare_cores, set_states
 from flowrep.experiment import build
 from flowrep.experiment.evaluation import (

@@ -4,24 +4,7 @@ import pytest
 import torch
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
-from flowrep.agent import observation
-from flowrep.agent.observation import compute_dtype, map_codecs
-
-
-def test_precision_auto_is_bfloat16_where_that_is_faster(monkeypatch):
-    cpu = torch.device("cpu")
-    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True})
-    for faster, dtype in ((True, torch.bfloat16), (False, torch.float32)):
-        monkeypatch.setattr(observation, "_bf16_products_are_faster", lambda faster=faster: faster)
-        assert compute_dtype("auto", cpu) is dtype
-    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx2": True})
-    assert compute_dtype("auto", cpu) is torch.float32
-    assert not observation.has_bf16(cpu)
-    assert compute_dtype("bf16", cpu) is torch.bfloat16
-    assert compute_dtype("auto", torch.device("meta")) is torch.float32
-    assert compute_dtype("fp32", cpu) is torch.float32
-    with pytest.raises(ValueError, match="precision='half'"):
-        compute_dtype("half", cpu)
+from flowrep.agent.observation import map_codecs
 
 
 def codec(spec, key="map", dtype=torch.float32):

@@ -243,7 +243,7 @@ def test_a_pretrained_agent_drives_where_never_turning_fails(scene):
 
 
 def test_a_saved_agent_computes_in_the_faster_format_of_this_machine(monkeypatch):
-    monkeypatch.setattr("flowrep.agent.observation.has_bf16", lambda device: False)
+    monkeypatch.setattr("flowrep.agent.precision.has_bf16", lambda device: False)
     agent = Agent.load("pretrained", scene="straight_road", device="cpu")
     assert agent.config.algorithm.precision == "fp32"  # it was trained in bf16
 

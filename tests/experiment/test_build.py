@@ -6,7 +6,7 @@ import pytest
 
 pytest.importorskip("pybullet", reason="a run is built with the simulator")
 
-from flowrep.agent import DoubleDQN, observation
+from flowrep.agent import DoubleDQN, precision
 from flowrep.config.algorithms import ALGORITHMS
 from flowrep.config.usage import UsageError
 from flowrep.experiment import build
@@ -52,20 +52,20 @@ def test_an_algorithm_is_found_by_its_name():
 @pytest.mark.parametrize(("faster", "chosen"), [(True, "bf16"), (False, "fp32")])
 @pytest.mark.usefixtures("own_module")
 def test_a_new_run_s_config_says_in_which_format_it_computes(monkeypatch, faster, chosen):
-    monkeypatch.setattr(observation, "has_bf16", lambda device: True)
-    monkeypatch.setattr(observation, "_bf16_products_are_faster", lambda: faster)
+    monkeypatch.setattr(precision, "has_bf16", lambda device: True)
+    monkeypatch.setattr(precision, "_bf16_products_are_faster", lambda: faster)
 
-    def precision(section):
+    def stored(section):
         config = composed("device=cpu").model_copy(update={"algorithm": section})
         return with_precision(config).plain()["algorithm"].get("precision")
 
     section = composed("device=cpu").algorithm
     assert section.precision == "auto"
-    assert precision(section) == chosen
+    assert stored(section) == chosen
     for given in ("bf16", "fp32"):
-        assert precision(section.model_copy(update={"precision": given})) == given
-    assert precision(named("someones.Learner", patience=3)) is None  # has no such option
-    assert precision(named("someones.Other", patience=3)) == chosen  # has it, with a default
+        assert stored(section.model_copy(update={"precision": given})) == given
+    assert stored(named("someones.Learner", patience=3)) is None  # has no such option
+    assert stored(named("someones.Other", patience=3)) == chosen  # has it, with a default
 
 
 @pytest.mark.parametrize(
