@@ -12,16 +12,8 @@ from torch.autograd import forward_ad
 
 from flowrep.extras import numba_is_installed
 from flowrep.geometry import closed_form
-from flowrep.geometry.camera import centred_pixels
-from flowrep.geometry.checks import check_name, check_rows, check_shape, common_batch
-from flowrep.geometry.closed_form import (
-    Planes,
-    as_type,
-    flow_planes,
-    known_camera,
-    motion_coefficients,
-    widest,
-)
+from flowrep.geometry.checks import check_name, check_shape, common_batch
+from flowrep.geometry.closed_form import as_type, widest
 
 Direction: TypeAlias = Literal["forward", "backward"]
 Grid: TypeAlias = Literal["current", "previous"]
@@ -182,7 +174,9 @@ def factorize(
         # Viewed as bytes, because inductor's CPU code can't compile a `where` on a bool view.
         raw = torch.where(raw_known.view(torch.uint8) != 0, raw, math.nan)
     # Ego flow is rounded as in `rigid_flow`, whatever raw's dtype, so that static obj is exactly 0.
-    u, v, valid = _planes(batch, depth, None, K, prev_K, prev_from_curr.unsqueeze(-3), dt)
+    u, v, valid = closed_form.planes(
+        batch, depth, None, K, prev_K, prev_from_curr.unsqueeze(-3), dt
+    )
     dtype, compute = widest(u.dtype, raw.dtype), widest(u.dtype, torch.float32)
     raw = as_type(raw, dtype).expand(*batch, -1, -1, -1)
     raw_u, raw_v = raw.unbind(-3)
@@ -314,74 +308,8 @@ def _flow(
 
         given: Any = {"motions": motions, "instance": instance}
         return Flow(*numba_flow.planes(batch, depth, K, prev_K, dt, **given)[:2])
-    u, v, valid = _planes(batch, depth, instance, K, prev_K, motions, dt)
+    u, v, valid = closed_form.planes(batch, depth, instance, K, prev_K, motions, dt)
     return Flow(closed_form.stack_planes(u, v), closed_form.mask_channel(valid))
-
-
-def _planes(
-    batch: torch.Size,
-    depth: Tensor,
-    instance: Tensor | None,
-    K: Tensor,
-    prev_K: Tensor | None,
-    motions: Tensor,
-    dt: float | Tensor,
-) -> Planes:
-    """Returns what `_flow` returns as planes, by PyTorch."""
-    height, width = depth.shape[-2:]
-    dtype = widest(*(x.dtype for x in (depth, K, prev_K, motions) if x is not None))
-    compute = widest(dtype, torch.float32)
-    K, dt, known = known_camera(as_type(K, compute), dt)
-    if prev_K is not None:
-        prev_K, _, prev_known = known_camera(as_type(prev_K, compute), 1.0)
-        prev_K, known = prev_K.unsqueeze(-3), known & prev_known
-    by_motion = motion_coefficients(
-        K.unsqueeze(-3), prev_K, as_type(motions, compute), known.unsqueeze(-1)
-    )  # [*B, N, 12]
-    x, y = centred_pixels(height, width, K)
-    depth = depth.squeeze(-3).expand(*batch, height, width)
-    if instance is not None:
-        instance = instance.squeeze(-3).expand(*batch, -1, -1)
-    if instance is None:
-        each = list(by_motion.unsqueeze(-2).unbind(-1))  # [*B, 1, 1]
-    else:
-        each = _of_pixels(by_motion, instance)
-    e = each[9:]
-    # q at infinity is A x~, which is affine in x and y: one term per column plus one per row.
-    columns = [a_x * x for a_x in each[:3]]
-    rows = [a_y * y + constant for a_y, constant in zip(each[3:6], each[6:9])]
-    # Without ids, each term has W or H values instead of H · W.
-    if instance is None and torch.compiler.is_compiling():
-        x, *columns = _slices_of_one(x, *columns)
-        y, *rows = _slices_of_one(y, *rows)
-    q_far = [column + row for column, row in zip(columns, rows)]
-    if isinstance(dt, Tensor):
-        dt = dt[..., None, None]
-    return flow_planes(depth, x, y, q_far, e, dt, dtype)
-
-
-def _of_pixels(by_motion: Tensor, instance: Tensor) -> list[Tensor]:
-    """Returns the twelve coefficients `[*B, H, W]` of each pixel's motion."""
-    *batch, height, width = instance.shape
-    at = instance.long().flatten(-2).unsqueeze(-2)
-    rows = by_motion.mT.expand(*batch, -1, -1)  # [*B, 12, N]
-    # One by one, inductor's code is a tenth faster; all at once, a single frame's.
-    parts = rows.split(1, -2) if torch.compiler.is_compiling() else [rows]
-    try:
-        each = [part.gather(-1, at.expand(*batch, part.shape[-2], -1)) for part in parts]
-        return [x for planes in each for x in planes.unflatten(-1, (height, width)).unbind(-3)]
-    except RuntimeError:
-        check_rows(int(instance.min()), int(instance.max()), by_motion.shape[-2])
-        raise
-
-
-def _slices_of_one(*entries: Tensor) -> tuple[Tensor, ...]:
-    """Returns the entries as slices of one tensor.
-
-    Inductor stores stacked entries. Otherwise it would compute them again at every pixel, which
-    takes 1.7 times as long.
-    """
-    return torch.stack(torch.broadcast_tensors(*entries)).unbind()
 
 
 def _suits_numba(depth: Tensor, *others: float | Tensor | None) -> bool:
