@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from flowrep import geometry
-from flowrep.diagnosis import explanation, fit, limits, pictures, poses, recordings
+from flowrep.diagnosis import fit, limits, recordings
 from flowrep.diagnosis.competition import Competition
 from flowrep.diagnosis.fit import (
     EYE,
@@ -279,19 +279,11 @@ def _bodies(seen: _Seen) -> tuple[str, str]:
     testable &= number >= limits.FEW_PIXELS
     if int(testable.sum()) < limits.FEW:
         return "untested", unseen
-    bodies = [f"body {i}" for i in body[testable].tolist()]
-    competition = Competition(pairs.select(testable), [])
-    found = judged(competition, bodies, _adapter_call)
+    names = [f"body {i}" for i in body[testable].tolist()]
+    found = judged(Competition(pairs.select(testable), []), names, _adapter_call)
     if found.is_wrong:
-        return "fault", f"instance_motion or ids don't fit the bodies: {found.words}"
-    # What a motion moves off its body depends on it in jumps, which no covariance knows.
-    pairs, shown = competition.recorded.pairs, competition.recorded.shown
-    exact = pictures.mixture(pairs, pairs.motion.unsqueeze(0), competition.noise)
-    left_px, most_px = found.left_px, poses.most_noise_px(pairs, competition.flow_px)
-    gain = explanation.agreed(shown.nats - exact.nats)
-    if gain > max(limits.SURE, 5 * len(bodies)) and left_px > most_px:  # 5 nats for each
-        why = f"they leave {left_px:.2g} px, and other motions fit better"
-        return "fault", f"instance_motion or ids don't fit the bodies: {why}"
+        left = f"{found.left_px:.2g} px are left, {found.best_px:.2g} px by other motions"
+        return "fault", f"instance_motion or ids don't fit the bodies: {left}"
     if not found.is_right:
         return "untested", f"motions of bodies are not tested: {found.words}"
     return "", ""

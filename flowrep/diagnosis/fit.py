@@ -138,12 +138,14 @@ def _smooth(inverse: Tensor) -> tuple[Tensor, float]:
     There, depth that is interpolated between pixels is a guess.
     """
     around = functional.pad(inverse, (1, 1, 1, 1), "replicate")
-    middle = inverse.clamp(min=1e-9)
-    bends = [around[:, 1:-1, 2:] + around[:, 1:-1, :-2], around[:, 2:, 1:-1] + around[:, :-2, 1:-1]]
-    bend = torch.stack([(sides - 2 * middle).abs() / middle for sides in bends]).amax(0)
-    noise = bend.flatten(1).nanmedian(-1).values[:, None, None]
+    sides = [around[:, 1:-1, 2:] + around[:, 1:-1, :-2], around[:, 2:, 1:-1] + around[:, :-2, 1:-1]]
+    bend = torch.stack([(both / (2 * inverse) - 1).abs() for both in sides]).amax(0)
+    bend = 2 * torch.where((inverse == 0) & (sides[0] + sides[1] == 0), 0.0, bend)  # amid the sky
+    is_near = inverse > 0
+    noise = torch.where(is_near, bend, math.nan).flatten(1).nanmedian(-1).values[:, None, None]
     is_smooth = bend < (5 * noise).clamp(min=_BEND)
-    rough = float(bend[is_smooth].square().mean().sqrt()) / math.sqrt(6) if is_smooth.any() else 0.0
+    near = bend[is_smooth & is_near]
+    rough = float(near.square().mean().sqrt()) / math.sqrt(6) if len(near) else 0.0
     return torch.where(is_smooth, inverse, math.nan), rough
 
 
