@@ -16,12 +16,10 @@ import torch
 from torch import Tensor
 
 from flowrep.diagnosis.fit import Pairs, flow_of, length, median
-from flowrep.diagnosis.limits import FEW, PAIR, SURE
+from flowrep.diagnosis.limits import BODY, FEW, PAIR, SURE
 from flowrep.diagnosis.pictures import Metric, Mixture, best_of
 from flowrep.diagnosis.poses import Poses, on_average
 from flowrep.diagnosis.rivals import Rival
-
-_BODY = 0.03  # of the pixels: a motion of fewer may be chance
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +72,7 @@ class Explanation:
         pair, known = torch.arange(len(self.poses.y)), ~self.pairs.depth.isnan()
         others = self.shown.odds.amax(0) - self.shown.odds[self.poses.mode, pair]
         share = torch.where(known, others, math.nan).nanmean(-1)
-        is_beside = (share > _BODY) & ~self.poses.is_bad
+        is_beside = (share > BODY) & ~self.poses.is_bad
         return self.pairs.by_flow and int(is_beside.sum()) >= FEW
 
     @property

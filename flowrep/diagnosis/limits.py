@@ -17,5 +17,6 @@ ALIKE = 3.0  # nats, twenty to one: explanations whose scores differ by less are
 
 FEW = 3  # frames or pairs: fewer may show anything by chance; and explanations that are told
 MANY = 0.2  # of all pairs or pixels: they matter
+BODY = 0.03  # of a pair's pixels: a motion of fewer may be chance
 FEW_PIXELS = 32  # of a body, of a pair twice as many: fewer tell nothing
 PAIRS = 12  # of an env that are tested at most, to save time

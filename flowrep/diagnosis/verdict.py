@@ -7,10 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+import torch
+
 from flowrep.diagnosis.competition import Competition
 from flowrep.diagnosis.explanation import Explanation
 from flowrep.diagnosis.fit import Pairs, length, median, middle, residuals
-from flowrep.diagnosis.limits import ALIKE, FEW, HARMLESS, MANY, REST_PX, SURE
+from flowrep.diagnosis.limits import ALIKE, BODY, FEW, HARMLESS, MANY, REST_PX, SURE
 from flowrep.diagnosis.pictures import best_of
 from flowrep.diagnosis.poses import most_noise_px
 from flowrep.diagnosis.rivals import Rival
@@ -176,6 +178,13 @@ class _Case:
             return self._diagnosis("something is wrong", f"{why}, {self.unknown}")
         if deviation_px > max(self.rough_px, least_px, 2 * resolution_px):
             why = f"the recorded motion is {deviation_px:.2g} px from that of the pictures"
+            return self._diagnosis("something is wrong", f"{why} ({self.size}), {self.unknown}")
+        # In directions that pixels don't determine, the nearest motion is as near as it likes.
+        rest, left_px = length(residuals(self.pairs, self.pairs.motion)), _left_px(self.recorded)
+        fits = torch.where(rest.isnan(), math.nan, (rest < _NOISE * self.found.noise.px).double())
+        is_lost = fits.nanmean(-1)[is_world] < BODY
+        if is_lost.double().mean() > 0.5 and left_px > max(self.rough_px, least_px):
+            why = f"hardly a pixel moves as recorded, {left_px:.2g} px are left"
             return self._diagnosis("something is wrong", f"{why} ({self.size}), {self.unknown}")
         off_px = poses.y.norm(dim=-1)
         is_bad = poses.is_bad & is_world & (off_px > _NOISE * poses.sigma_px)
