@@ -53,7 +53,10 @@ class Competition:
         of_poses: list[Candidate] = []
         of_data: list[Candidate] = []
         for each in (x for x in found if x is not None):
-            (of_poses if each.rival.subject == "poses" else of_data).append(each)
+            if each.rival.subject == "poses":
+                of_poses.append(each)
+            elif each.misfit < math.inf:  # a mirrored half of a picture may have no depth at all
+                of_data.append(each)
         # Without poses, the motion that a correction makes fit isn't known yet: all compete.
         scored = _SCORED if pairs.has_poses else len(of_data)
         of_data = sorted(of_data, key=lambda each: each.misfit)[:scored]

@@ -12,7 +12,7 @@ import torch
 from flowrep.diagnosis.competition import Competition
 from flowrep.diagnosis.explanation import Explanation
 from flowrep.diagnosis.fit import Pairs, length, median, middle, residuals
-from flowrep.diagnosis.limits import ALIKE, BODY, FEW, HARMLESS, MANY, REST_PX, SURE
+from flowrep.diagnosis.limits import ALIKE, BODY, FEW, HARMLESS, MANY, MOST_NOISE, REST_PX, SURE
 from flowrep.diagnosis.pictures import best_of
 from flowrep.diagnosis.poses import most_noise_px
 from flowrep.diagnosis.rivals import Rival
@@ -68,8 +68,9 @@ class Diagnosis:
         lines = [f"{self.verdict}: {self.words}"]
         if self.pairs:
             rows = {"as recorded": self.left_px, "with the best motion": self.best_px}
-            ranked = sorted(self.rivals_px.items(), key=lambda row: row[1])
-            rows |= {name.partition("=[")[0]: px for name, px in ranked[:5] if self.is_wrong}
+            order = {x: (x not in self.suspects, px) for x, px in self.rivals_px.items()}
+            named = sorted(order, key=order.__getitem__)[: 5 * self.is_wrong]
+            rows |= {name[:52]: self.rivals_px[name] for name in named}
             lines += [f"  {name:52} leaves {px:8.3f} px" for name, px in rows.items()]
             lines.append(f"  median flow {self.raw_px:.2f} px, {self.pairs} pairs of frames")
         if self.unseen:
@@ -102,8 +103,9 @@ class _Case:
         self.found, self.recorded, self.pairs = found, found.recorded, found.recorded.pairs
         px, share = HARMLESS
         self.harmless_px = max(px, share * found.flow_px)
+        self.is_at_rest = max(found.flow_px, found.ego_px) < REST_PX
         # At rest, there is no flow but that of poses' noise to be wrong.
-        self.unsure_px = 3 * self.harmless_px if found.flow_px > REST_PX else REST_PX
+        self.unsure_px = REST_PX if self.is_at_rest else 3 * self.harmless_px
         self.rough_px = max(most_noise_px(self.pairs, found.flow_px), self.harmless_px)
         self.noise_px = found.noise.typical_px
         self.effects_px = {each: each.effect_px(self.recorded) for each in found.others}
@@ -144,12 +146,12 @@ class _Case:
     ) -> Diagnosis | None:
         """Returns the verdict if other explanations than the data as recorded are likelier."""
         least_px = max(self.harmless_px, self.bias_px, 2 * self.noise_px * self.pairs.is_estimated)
-        if self.found.flow_px < REST_PX:
+        if self.is_at_rest:
             least_px = max(least_px, self.rough_px)
         if self.recorded.poses is not None:  # what pictures don't show is no mistake for certain
             least_px = max(least_px, self.recorded.systematic_px[1])
-        vague_px = self.unsure_px + self.bias_px
-        alike = _likeliest(self.found, self.effects_px, least_px, vague_px)
+        vague_px = max(self.unsure_px, least_px) + self.bias_px
+        alike = self._likeliest(least_px, vague_px)
         if not alike:
             return None
         texts = [each.rival.texts(each.n, self.pairs.now.shape[-1]) for each in alike]
@@ -163,6 +165,42 @@ class _Case:
         )
         suspects = tuple(remedy for remedy, _ in texts)
         return self._diagnosis("wrong", f"{' or '.join(ways)}; {self.size}", suspects=suspects)
+
+    def _likeliest(self, least_px: float, vague_px: float) -> list[Explanation]:
+        """Returns explanations that are better than the data as recorded for certain, and alike.
+
+        They matter, and leave little themselves, if more than noise, so that a second mistake may
+        be left, but no other one instead.
+
+        Args:
+            least_px: what a mistake with a name has to change flow by.
+            vague_px: the same of one without.
+        """
+        recorded, proven = self.recorded, [x for x in self.found.others if self.found.is_proven(x)]
+        if recorded.poses is not None:
+            most_px = max(self.rough_px, MOST_NOISE * recorded.deviation_px)
+            proven = [x for x in proven if x.deviation_px <= most_px]
+        effects_px = self.effects_px
+        matters = [effects_px[x] > (vague_px if x.rival.is_vague else least_px) for x in proven]
+        sure = {x: x.sure_nats(recorded) for x, does in zip(proven, matters) if does}
+        most = max(sure.values(), default=0.0)
+        ranked = sorted(sure, key=lambda each: (-min(sure[each], most - ALIKE), -each.nats))
+        named = [each for each in ranked if not each.rival.is_vague]
+        if named and sure[named[0]] > _ALIKE_SHARE * sure[ranked[0]]:
+            ranked = named  # what is left may be a second mistake
+        if not ranked or min(sure[ranked[0]], ranked[0].nats - recorded.nats) <= SURE:
+            return []
+        first = ranked[0]
+        if any(x.sure_nats(first) > SURE for x, does in zip(proven, matters) if not does):
+            return []  # what is wrong, if anything, is something that changes nothing
+        if first.rival.is_vague:
+            return [first]
+        # Those that pairs don't agree to be worse than the first.
+        alike = [x for x in named if first.sure_nats(x) <= ALIKE and sure[x] > 0]
+        alike = sorted(alike, key=lambda each: -each.nats)
+        # Of those with one subject, the ones with more numbers than needed say nothing more.
+        fewest = {e.rival.subject: len(e.n) for e in sorted(alike, key=lambda e: -len(e.n))}
+        return [each for each in alike if len(each.n) <= fewest[each.rival.subject] + 1][:FEW]
 
     def of_poses(self, names: Sequence[str]) -> Diagnosis | None:
         """Returns the verdict if recorded motions aren't those of the pictures; adds notes."""
@@ -231,50 +269,13 @@ class _Case:
         if self.recorded.poses is None:
             self.notes.append("poses, K and the unit of depth are not tested")
             return self._diagnosis("right", f"one motion explains raw flow and depth {noise}")
-        if self.found.flow_px < REST_PX:
+        if self.is_at_rest:
             self.notes.append("the camera hardly moves: K and depth are not tested")
         parts = "raw flow, " * self.pairs.by_flow + "depth, K, the camera's motion"
         words = f"{parts} agree to within {self.error_px:.2g} px {noise}"
         words += f" and poses' {self.poses_px:.2g} px"
         unseen = _unseen(self.pairs, self.found.rivals, max(self.error_px, self.harmless_px))
         return self._diagnosis("right", words, unseen=unseen)
-
-
-def _likeliest(
-    found: Competition, effects: Mapping[Explanation, float], least_px: float, vague_px: float
-) -> list[Explanation]:
-    """Returns the explanations that are better than the data as recorded for certain, and alike.
-
-    Args:
-        least_px: what a mistake with a name has to change flow by.
-        vague_px: the same of one without.
-    """
-    proven = [each for each in found.others if found.is_proven(each)]
-    sure = {each: each.sure_nats(found.recorded) for each in proven}
-    most = max(sure.values(), default=0.0)
-    ranked = sorted(sure, key=lambda each: (-min(sure[each], most - ALIKE), -each.nats))
-    named = [each for each in ranked if not each.rival.is_vague]
-    if named and sure[named[0]] > _ALIKE_SHARE * sure[ranked[0]]:
-        ranked = named  # what is left may be a second mistake
-    if not ranked:
-        return []
-    first = ranked[0]
-    least_px = vague_px if first.rival.is_vague else least_px
-    gain = min(sure[first], first.nats - found.recorded.nats)
-    if gain <= SURE or effects[first] <= least_px:
-        return []
-    if first.rival.is_vague:
-        return [first]
-    # Those that pairs don't agree to be worse than the first, and that matter as much.
-    alike = [
-        each
-        for each in named
-        if first.sure_nats(each) <= ALIKE and sure[each] > 0 and effects[each] > least_px
-    ]
-    alike = sorted(alike, key=lambda each: -each.nats)
-    # Of those with one subject, the ones with more numbers than needed say nothing more.
-    fewest = {e.rival.subject: len(e.n) for e in sorted(alike, key=lambda e: -len(e.n))}
-    return [each for each in alike if len(each.n) <= fewest[each.rival.subject] + 1][:FEW]
 
 
 def _left_px(each: Explanation) -> float:
