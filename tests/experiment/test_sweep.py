@@ -17,6 +17,7 @@ from flowrep.experiment.outcomes import COLUMNS, is_finished
 from flowrep.experiment.schema import TrainConfig
 from flowrep.files import open_to_append, read_rows, write_rows
 from tests.config.composing import composed, plain
+from tests.running import ENVIRONMENT, run_here
 
 
 def test_several_runs_are_asked_for_in_hydras_ways():
@@ -171,44 +172,42 @@ def test_an_experiment_is_named_in_the_config_of_its_runs(name):
 # A sweep as a person runs it.
 
 LINE = [
-    sys.executable, "-m", "flowrep.train", "-m", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2",
-    "debug=smoke", "representations=[obj]", "device=cpu", "num_envs=2", "algorithm.hidden_size=16",
-    "total_frames=240", "checkpoint_every_frames=40", "log_every_frames=20",
-    "evaluation.every_frames=0", "evaluation.final_episodes=1", "evaluation.speeds=[high]",
-    "evaluation.baselines=[]", "evaluation.video=false", "scene.time_limit_steps=30",
+    "python", "-m", "flowrep.train", "--multirun", "debug=smoke", "representations=[obj]",
+    "device=cpu", "num_envs=2", "algorithm.hidden_size=16", "total_frames=240",
+    "checkpoint_every_frames=40", "log_every_frames=20", "evaluation.every_frames=0",
+    "evaluation.final_episodes=1", "evaluation.speeds=[high]", "evaluation.baselines=[]",
+    "evaluation.video=false", "scene.time_limit_steps=30",
+    "algorithm.learning_rate=-1,3e-4",  # the first is refused before its run begins
 ]  # fmt: skip
-RATES = "algorithm.learning_rate=3e-4,-1"  # the second is refused before its run begins
-ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1"}
-
-
-def started(folder):
-    return subprocess.Popen(
-        [*LINE, RATES, f"hydra.sweep.dir={folder}"],
-        stdout=(folder / "printed").open("w"),  # a pipe would be held open by its workers
-        stderr=subprocess.STDOUT,
-        env=ENVIRONMENT,
-        start_new_session=True,
-    )
+TWO_AT_A_TIME = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
 
 
 @pytest.mark.slow
-def test_an_interrupted_sweep_goes_on_and_a_failed_run_stops_no_other(tmp_path):
-    """Ctrl-C stops it after its first checkpoint; the second start ends it."""
+def test_an_interrupted_sweep_goes_on_and_a_failed_run_stops_no_other(
+    tmp_path, monkeypatch, capsys
+):
+    """Ctrl-C stops it after its first checkpoint; the second start ends it, with one job a time."""
     pytest.importorskip("pybullet", reason="training drives the simulated street")
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="it runs two at a time")
-    process = started(tmp_path)
+    where = f"hydra.sweep.dir={tmp_path}"
+    with (tmp_path / "printed").open("w") as printed:  # a pipe would be held open by its workers
+        process = subprocess.Popen(
+            [sys.executable, *LINE[1:], *TWO_AT_A_TIME, where],
+            stdout=printed, stderr=subprocess.STDOUT, env=ENVIRONMENT, start_new_session=True,
+        )  # fmt: skip
     checkpoint, deadline = "*rate-0.0003*/checkpoint/latest.safetensors", time.monotonic() + 180
     while not any(tmp_path.glob(checkpoint)) and time.monotonic() < deadline:
         time.sleep(0.05)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does
     assert process.wait(timeout=180) == 130
-    assert started(tmp_path).wait(timeout=300) == 1
-    printed = (tmp_path / "printed").read_text()
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    assert run_here(monkeypatch, [*LINE, where]) == 1
+    printed = capsys.readouterr().out
     assert "1 of 2 runs finished" in printed
     (failed,) = tmp_path.glob("*learning_rate--1*")
     assert f"log: {failed}/job.log" in printed
     assert "error: algorithm.learning_rate" in (failed / "job.log").read_text()
-    assert f"hydra.sweep.dir={tmp_path}" in printed
+    assert where in printed
     (whole,) = tmp_path.glob("*learning_rate-0.0003*")
     rows = read_rows(whole / "metrics.csv")
     assert [int(row["frames"]) for row in rows] == list(range(20, 241, 20))
