@@ -67,7 +67,6 @@ def test_flow_is_one_graph(dt, prev_K):
 @pytest.mark.slow
 @needs_compiler
 def test_compiled_code_gives_the_bits_of_eager_from_transposed_memory_too():
-    """With one K for both frames, tests/transforms/test_compile.py has inductor compile it."""
     depth, instance, camera, motions = inputs(2)
     given = depth.mT.contiguous().mT, instance, camera, motions, 1.0, 1.1 * camera
     got, expected = torch.compile(everything, fullgraph=True)(*given), everything(*given)
