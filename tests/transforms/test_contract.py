@@ -273,9 +273,6 @@ ENVS = {
     "inside of forked workers": lambda: ParallelEnv(
         2, envs_with_everything(), mp_start_method="fork"
     ),
-    "inside of a spawned worker": lambda: ParallelEnv(  # one: each imports TorchRL anew
-        1, envs_with_everything()[:1], mp_start_method="spawn"
-    ),
 }
 
 
