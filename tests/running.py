@@ -1,7 +1,8 @@
-"""Python in a process of its own, and commands in this one."""
+"""Python in a process of its own, commands in this one, and the names that docs explain."""
 
 import importlib
 import os
+import re
 import runpy
 import subprocess
 import sys
@@ -33,3 +34,9 @@ def run_here(monkeypatch, command):
     except SystemExit as ended:
         return ended.code or 0
     return 0
+
+
+def glossary():
+    """Returns the names that the page of metrics explains."""
+    page = ROOT / "docs" / "metrics.md"
+    return {*re.findall(r"`(\w+)`", page.read_text(encoding="utf-8"))}

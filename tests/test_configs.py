@@ -22,7 +22,8 @@ def test_every_choice_builds_an_env_and_an_agent_that_act(group, name):
     from flowrep.experiment import build
 
     choice = f"representations=[{name}]" if group == "representations" else f"{group}={name}"
-    small = [] if group == "debug" else ["num_envs=1", "algorithm.batch_size=16"]
+    small = ["algorithm.batch_size=16", "algorithm.hidden_size=16"]
+    small += [] if group == "debug" else ["num_envs=1"]
     config = composed(choice, *small, "device=cpu")
     assert config.plain() == plain("train", choice, *small, "device=cpu")
     env = build.env(config)

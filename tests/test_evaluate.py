@@ -236,9 +236,7 @@ def of_low_speed(rows):
     return [row for row in rows if (row["speed"], row["policy"]) == ("low", "greedy")]
 
 
-@pytest.mark.parametrize(
-    ("number", "num_workers"), [(signal.SIGINT, 0), (signal.SIGTERM, 2), (signal.SIGHUP, 2)]
-)
+@pytest.mark.parametrize(("number", "num_workers"), [(signal.SIGINT, 0), (signal.SIGTERM, 2)])
 def test_an_evaluation_that_was_stopped_keeps_whole_groups_and_leaves_no_trace_once_run_again(
     some, driver, worker_processes, number, num_workers
 ):

@@ -13,7 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from flowrep.agent import cpu, load_checkpoint, save_checkpoint, torch_threads
 from flowrep.agent.cuda_graph import with_fixed_layout
 from flowrep.agent.divergence import DivergenceError, DivergenceWatch
-from tests.running import run_python
+from tests.running import glossary, run_python
 
 ENVS = 5
 
@@ -47,6 +47,7 @@ def test_an_update_moves_all_weights_and_returns_every_metric(make_any, random_s
     (*_, last) = learn(agent, random_steps, 12)
     assert [name for name, weight in weights(agent).items() if weight.equal(before[name])] == []
     assert tuple(sorted(last)) == tuple(sorted(agent.metric_names()))
+    assert {*last} <= glossary()
     assert all(value.shape == () and not value.requires_grad for value in last.values())
     assert all(value.isfinite() for name, value in last.items() if name != "explained_variance")
 

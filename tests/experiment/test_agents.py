@@ -20,9 +20,6 @@ from tests.comparing import differing
 from tests.config.composing import composed
 
 SCENES = sorted(group_choices("scene"))
-# of 10 episodes; one that never turns drives Straight Road in one of ten, the other scenes never
-LEAST = 8
-
 
 TINY = {
     "scene": "s_turn", "representations": ["obj"], "debug": "smoke", "total_frames": 128,
@@ -238,8 +235,9 @@ def test_every_scene_has_a_pretrained_agent_of_at_most_three_megabytes():
 
 @pytest.mark.parametrize("scene", [pytest.param(s, marks=pytest.mark.slow) for s in SCENES])
 def test_a_pretrained_agent_drives_where_never_turning_fails(scene):
-    episodes = Agent.load("pretrained", scene=scene, device="cpu").evaluate(10, seed=0)
-    assert sum(each.outcome == "success" for each in episodes) >= LEAST
+    episodes = Agent.load("pretrained", scene=scene, device="cpu").evaluate(5, seed=0)
+    # one that never turns drives Straight Road in one of ten episodes, the other scenes never
+    assert sum(each.outcome == "success" for each in episodes) >= 4
 
 
 def test_a_saved_agent_computes_in_the_faster_format_of_this_machine(monkeypatch):

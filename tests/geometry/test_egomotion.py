@@ -10,7 +10,7 @@ from flowrep import geometry as g
 from flowrep.geometry.pose import rotation_from_vector
 from tests.geometry.scenes import rigid
 
-SIZE, PAIRS = 84, 60
+SIZE, PAIRS = 84, 30
 CAMERA = torch.tensor([[72.7, 0.0, 40.0], [0.0, 66.1, 45.0], [0.0, 0.0, 1.0]])
 SCENES = ["straight_road", "s_turn", "h_shaped_pathways", "three_way_junction"]
 
