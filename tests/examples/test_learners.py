@@ -1,4 +1,4 @@
-"""Other people's learners run on flowrep's streets: each example trains for 256 steps."""
+"""Other people's learners run on flowrep's streets: each example trains for 128 steps."""
 
 import importlib
 
@@ -26,8 +26,8 @@ def test_the_example_learns_from_representations(example, needs):
         return [parameter.detach().clone() for parameter in module.parameters()]
 
     # From the same seed, and so from the same weights: one rollout of 2 x 4 steps, and four of
-    # 2 x 32, in which episodes end.
-    once, often = weights(8, 4), weights(256, 32)
+    # 2 x 16, in which episodes end.
+    once, often = weights(8, 4), weights(128, 16)
     assert sum(weight.numel() for weight in often) > 1_000_000
     assert all(weight.isfinite().all() for weight in often)
     assert all(not torch.equal(a, b) for a, b in zip(once, often) if a.ndim > 1)
