@@ -7,6 +7,7 @@ import gc
 import signal
 import tempfile
 from collections import Counter
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -100,23 +101,33 @@ def one_stands(straight_road):
 
 
 @pytest.fixture
-def make_street():
-    """Makes streets that are closed when the test ends."""
+def close_later():
+    """Takes what has to be closed when the test ends, and returns it."""
+    with ExitStack() as stack:
+        yield lambda made: stack.enter_context(closing(made))
+
+
+@pytest.fixture(scope="session")
+def open_streets():
+    """Streets of one scene share what takes longest to build, as long as one of them is open."""
     from flowrep.envs import StreetEnv
 
-    made = []
-
-    def make(*args, **kwargs):
-        made.append(StreetEnv(*args, **kwargs))
-        return made[-1]
-
-    yield make
-    for street in made:
+    streets = [StreetEnv(scene, sensors=()) for scene in ("straight_road", "h_shaped_pathways")]
+    yield
+    for street in streets:
         street.close()
 
 
 @pytest.fixture
-def drive():
+def make_street(close_later, open_streets):
+    """Makes streets that are closed when the test ends."""
+    from flowrep.envs import StreetEnv
+
+    return lambda *args, **kwargs: close_later(StreetEnv(*args, **kwargs))
+
+
+@pytest.fixture
+def drive(open_streets):
     """Drives episodes 0, 1, ... with a baseline, and returns them as they end."""
     from flowrep.envs import make_env
     from flowrep.experiment.evaluation import evaluate

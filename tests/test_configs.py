@@ -17,6 +17,7 @@ GROUP_FILES = [(group, name) for group in GROUPS for name in group_choices(group
 
 
 @pytest.mark.slow_after_first
+@pytest.mark.usefixtures("open_streets")
 @pytest.mark.parametrize(("group", "name"), GROUP_FILES)
 def test_every_choice_builds_an_env_and_an_agent_that_act(group, name):
     from flowrep.experiment import build

@@ -45,7 +45,7 @@ REFUSED = {
         "input=nothing output=out format=tum",
     ],
     "report": ["x policy=fast", "nothing"],
-    "view": ["speed=fast", "policy=nothing.py:make"],
+    "view": ["speed=fast", "policy=nothing.py:make", "policy=pilot"],
 }
 RUN_EACH_LINE = """
 import runpy, sys

@@ -35,17 +35,9 @@ NOISE = {"depth_sigma_per_m": 0.01, "depth_dropout": 0.1, "drift_m": 0.05, "drif
 
 
 @pytest.fixture
-def make():
+def make(close_later):
     """Makes envs that are closed when the test ends."""
-    made = []
-
-    def make(*args, **kwargs):
-        made.append(make_env(*args, **kwargs))
-        return made[-1]
-
-    yield make
-    for env in made:
-        env.close(raise_if_closed=False)
+    return lambda *args, **kwargs: close_later(make_env(*args, **kwargs))
 
 
 @pytest.fixture(scope="module")

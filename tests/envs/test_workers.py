@@ -59,16 +59,12 @@ class Counter(gym.Env):
 
 
 @pytest.fixture
-def make():
-    made = []
-
+def make(close_later):
     def make(num_envs, num_workers):
-        made.append(WorkerVectorEnv([partial(Counter, i) for i in range(num_envs)], num_workers))
-        return made[-1]
+        factories = [partial(Counter, i) for i in range(num_envs)]
+        return close_later(WorkerVectorEnv(factories, num_workers))
 
-    yield make
-    for env in made:
-        env.close()
+    return make
 
 
 def in_process(num_envs):

@@ -111,17 +111,9 @@ def test_an_evaluation_is_stepped_by_a_process_a_core_if_each_has_enough_to_do(
     "line",
     [
         "representations.ego.scale=nan",
-        "representations.ego.scale=a",
         "+representations.ego.k=2",
-        "representations.seg2.k=0 representations=[seg2]",
-        "representations.depth.missing=2 representations=[depth]",
         "noise.depth_dropout=1.5",
-        "noise.drift_m=-1",
-        "+noise.drift=1",
         "flow.estimator=abc flow=estimated",
-        "flow.estimator=raft_small flow=estimated",  # without weights
-        "flow.weights=raft.pth flow=estimated",  # which dis doesn't have
-        "flow.preset=slow flow=estimated",
         "+flow.preset=fast",  # of exact flow
         "threads=1000",
         "device=cuda:93",

@@ -19,18 +19,14 @@ def leave_the_road(tensordict):
 
 
 @pytest.fixture
-def film_of():
+def film_of(close_later):
     """Films an agent of a config that leaves the road to the left; closed when the test ends."""
-    made = []
 
     def film_of(*overrides, policy=leave_the_road):
         small = "debug=smoke", "device=cpu"
-        made.append(Film(Agent(policy, composed(*small, *overrides))))
-        return made[-1]
+        return close_later(Film(Agent(policy, composed(*small, *overrides))))
 
-    yield film_of
-    for film in made:
-        film.close()
+    return film_of
 
 
 def test_a_drive_has_a_frame_for_each_step_of_the_episode_that_was_asked_for(film_of):

@@ -26,29 +26,14 @@ def refusal(command, model, line):
     "line",
     [
         # types and ranges
-        "algorithm.gamma=2",
-        "algorithm.gamma=nan",
-        "algorithm.n_steps=0",
-        "algorithm.tau=0",
-        "algorithm.learning_rate=inf",
-        "algorithm.batch_size=1.5",
-        "algorithm.initial_epsilon=3 algorithm=dqn",
-        "evaluation.speeds=[]",
-        "evaluation.speeds=normal",
-        "evaluation.speeds=[low,low]",
-        "evaluation.fps=[12,0.1]",
-        "evaluation.policies=[greedy,random]",
-        "evaluation=null",
-        "total_frames=2e6",
-        "seed=-1",
-        "device=meta",
-        "representations=[]",
-        "representations.ego=null",
-        "+representations.rgb=null",
+        "algorithm.gamma=2", "algorithm.gamma=nan", "algorithm.n_steps=0", "algorithm.tau=0",
+        "algorithm.learning_rate=inf", "algorithm.batch_size=1.5",
+        "algorithm.initial_epsilon=3 algorithm=dqn", "evaluation=null", "evaluation.speeds=[]",
+        "evaluation.speeds=normal", "evaluation.speeds=[low,low]", "evaluation.fps=[12,0.1]",
+        "evaluation.policies=[greedy,random]", "total_frames=2e6", "seed=-1", "device=meta",
+        "representations=[]", "representations.ego=null", "+representations.rgb=null",
         # keys
-        "~seed",
-        "+algorithm.gama=0.9",
-        "+algorithm.tau=0.1 algorithm=ppo",
+        "~seed", "+algorithm.gama=0.9", "+algorithm.tau=0.1 algorithm=ppo",
         # what leaves nothing to learn
         "algorithm.learning_starts=4991 total_frames=5000",
         "algorithm.batch_size=31",
@@ -59,7 +44,7 @@ def refusal(command, model, line):
         "algorithm.replay_capacity=63 num_envs=32",
         "algorithm.batch_size=2049 algorithm=ppo",
     ],
-)
+)  # fmt: skip
 def test_an_impossible_value_is_refused_by_its_key(line):
     key = line.split()[0].split("=")[0].lstrip("~+").split(".")[-1]
     assert key in refusal("train", TrainConfig, line)

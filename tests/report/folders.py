@@ -10,25 +10,19 @@ EPISODES = 8
 
 def config_of(scene="straight_road", stack="ego+obj", seed=0, **changes):
     """A run's config, as little of it as a report reads."""
+    speeds = {"low": [0.6, 1], "normal": [1.2, 1.8], "high": [2, 2.4]}
     config = {
-        "seed": seed,
-        "device": "cpu",
-        "speed": "normal",
-        "total_frames": 1000,
-        "num_envs": 2,
+        "seed": seed, "device": "cpu", "speed": "normal", "total_frames": 1000, "num_envs": 2,
         "representations": {name: {} for name in stack.split("+")},
-        "flow": {"source": "exact"},
-        "motion": "exact",
+        "flow": {"source": "exact"}, "motion": "exact",
         "noise": {"depth_sigma_per_m": 0.0, "drift_m": 0.0},
         "scene": {
-            "name": scene,
-            "frame_rate_hz": 12.0,
+            "name": scene, "frame_rate_hz": 12.0, "pedestrian_speed_mps": speeds,
             "time_limit_steps": {"straight_road": 200}.get(scene, 250),
             "camera": {"height_px": 48, "width_px": 64},
-            "pedestrian_speed_mps": {"low": [0.6, 1], "normal": [1.2, 1.8], "high": [2, 2.4]},
         },
         "algorithm": {"_target_": "flowrep.agent.DiscreteSAC", "tau": 0.02},
-    }
+    }  # fmt: skip
     for key, value in changes.items():
         *places, last = key.split("__")
         section = config
@@ -45,20 +39,13 @@ def rows_of(config, outcomes, *, speed="normal", fps=12.0, policy="greedy", **ch
         outcomes: a letter an episode: s(uccess), c(ollision), o(ut of bounds), t(ime-out).
     """
     names = {"s": "success", "c": "collision", "o": "out_of_bounds", "t": "timeout"}
+    same = {"scene": config["scene"]["name"], "frames": config["total_frames"]}
+    same |= {"evaluation": "evaluate", "policy": policy, "speed": speed, "fps": fps}
+    same |= {"return": 1.0, "length": 150}
     return [
-        {
-            "scene": config["scene"]["name"],
-            "frames": config["total_frames"],
-            "evaluation": "evaluate",
-            "policy": policy,
-            "speed": speed,
-            "fps": fps,
-            "episode_seed": 100 + k,
-            "outcome": names[letter],
-            "hit": "pedestrian" if letter == "c" else "",
-            "return": 1.0,
-            "length": 150,
-        }
+        same
+        | {"episode_seed": 100 + k, "outcome": names[letter]}
+        | {"hit": "pedestrian" if letter == "c" else ""}
         | changes
         for k, letter in enumerate(outcomes)
     ]

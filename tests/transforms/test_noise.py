@@ -15,7 +15,6 @@ from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv
 
 from flowrep.geometry import check_rigid
 from flowrep.transforms import SensorNoise
-from flowrep.transforms.base import MissingKey
 from flowrep.transforms.noise import (
     drifted_motion,
     frame_bits,
@@ -176,12 +175,6 @@ def test_envs_of_one_function_draw_noise_of_their_own(batched):
     finally:
         env.close()
     assert (motion[0] != motion[1]).all()
-
-
-def test_noise_by_frame_needs_the_frame_s_name():
-    noise = SensorNoise(drift_m=0.1, frame_key=["sensor", "frame"])  # as YAML has it
-    with pytest.raises(MissingKey, match=r"\('sensor', 'frame'\)"):
-        TransformedEnv(FakeSensorEnv((2,)), noise).rollout(1)
 
 
 # The first outputs of the generator's reference implementation for seed 1234567.
