@@ -149,7 +149,7 @@ def test_an_interrupted_run_saves_and_says_how_to_go_on(tmp_path, short_folder):
     """By Ctrl-C in a terminal; tests/test_progress.py has the other signals."""
     line = [
         sys.executable, "-m", "flowrep.train", "debug=smoke", "total_frames=1000000",
-        "log_every_frames=16", "checkpoint_every_frames=1000000", "num_workers=2",
+        "log_every_frames=16", "checkpoint_every_frames=1000000", "num_workers=1",
         f"hydra.run.dir={tmp_path}/run",
     ]  # fmt: skip
     process = subprocess.Popen(
@@ -163,10 +163,10 @@ def test_an_interrupted_run_saves_and_says_how_to_go_on(tmp_path, short_folder):
     deadline = time.monotonic() + 120
     while not (tmp_path / "run" / "metrics.csv").exists() and time.monotonic() < deadline:
         time.sleep(0.1)
-    os.killpg(process.pid, signal.SIGINT)  # as terminals do, the workers too
+    os.killpg(process.pid, signal.SIGINT)  # as terminals do, its worker too
     printed, errors = process.communicate(timeout=120)
     assert process.returncode == 128 + signal.SIGINT
     assert "Traceback" not in errors
     assert f"python -m flowrep.train resume={tmp_path}/run" in printed
     assert (tmp_path / "run" / "checkpoint" / "latest.safetensors").exists()
-    assert not list(short_folder.glob("pymp-*"))  # what workers are told by
+    assert not list(short_folder.glob("pymp-*"))  # what a worker is told by
