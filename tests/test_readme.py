@@ -19,13 +19,6 @@ def test_the_readmes_python_runs_with_the_readers_own_env():
     assert set(namespace["rollout"].keys()) >= {"ego", "obj"}
 
 
-def test_the_readme_names_every_representation():
-    from flowrep.transforms import REPRESENTATIONS
-
-    text = README.read_text(encoding="utf-8")
-    assert all(f"`{name}`" in text for name in REPRESENTATIONS)
-
-
 def test_every_picture_of_the_readme_is_there_and_small():
     pictures = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", README.read_text(encoding="utf-8"))
     assert pictures

@@ -237,7 +237,7 @@ def test_every_scene_has_a_pretrained_agent_of_at_most_three_megabytes():
 def test_a_pretrained_agent_drives_where_never_turning_fails(scene):
     episodes = Agent.load("pretrained", scene=scene, device="cpu").evaluate(5, seed=0)
     # one that never turns drives Straight Road in one of ten episodes, the other scenes never
-    assert sum(each.outcome == "success" for each in episodes) >= 4
+    assert sum(each.outcome == "success" for each in episodes) >= 3
 
 
 def test_a_saved_agent_computes_in_the_faster_format_of_this_machine(monkeypatch):
