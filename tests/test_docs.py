@@ -200,8 +200,8 @@ def test_getting_started_works_as_it_is_pasted(tmp_path, monkeypatch):
     for words in commands_in(page):
         if words[0] == "make":
             assert words[1] in targets
-        # tests/experiment/test_agents.py drives it, and one training is enough
-        if words[0] != "python" or "policy=pretrained" in words or "debug=smoke" in words:
+        # tests/test_view.py drives, and one training is enough
+        if words[0] != "python" or "flowrep.view" in words or "debug=smoke" in words:
             continue
         if "flowrep.evaluate" in words:
             words = [word for word in words if not word.startswith("episodes=")]

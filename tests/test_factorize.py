@@ -54,18 +54,6 @@ def files_of(folder):
 
 
 @pytest.fixture
-def diagnosed():
-    """Has jobs diagnose their recording, which takes most of the time of a short one."""
-
-
-@pytest.fixture(autouse=True)
-def as_asked(request, monkeypatch):
-    """Without `diagnosed`, jobs take recordings as they are."""
-    if "diagnosed" not in request.fixturenames:
-        monkeypatch.setattr(Job, "examine", lambda job: None)
-
-
-@pytest.fixture
 def moments(tmp_path):
     return synthetic.write_frames(tmp_path / "in")
 
@@ -76,7 +64,7 @@ def test_a_full_disk_is_named(moments, tmp_path, monkeypatch):
         factorize(tmp_path)
 
 
-def test_a_job_writes_flow_pictures_masks_tables_and_a_video(moments, tmp_path, diagnosed):
+def test_a_job_writes_flow_pictures_masks_tables_and_a_video(moments, tmp_path):
     everything = ["flow_files=[flo,kitti,npz]", "pictures_every=2", "moving_px=0.01"]
     code, out = factorize(tmp_path, "flow=exact", *everything)
     assert code == 0
@@ -124,9 +112,7 @@ def test_a_job_writes_flow_pictures_masks_tables_and_a_video(moments, tmp_path, 
     assert (summary["frames"], summary["suspects"]) == (2, [])
 
 
-def test_a_wrong_convention_ends_the_job_if_asked_and_else_is_a_warning(
-    moments, tmp_path, capsys, diagnosed
-):
+def test_a_wrong_convention_ends_the_job_if_asked_and_else_is_a_warning(moments, tmp_path, capsys):
     wrong = ["format.pose_direction=world_to_camera", "video=false", "flow_files=[]"]
     wrong += ["flow=exact", "pictures_every=0"]
     code, out = factorize(tmp_path, *wrong, "check=error")
@@ -143,7 +129,7 @@ def test_a_wrong_convention_ends_the_job_if_asked_and_else_is_a_warning(
     assert summary["diagnosis"].startswith("wrong: ")
 
 
-def test_poses_that_are_not_used_are_not_judged(moments, tmp_path, diagnosed):
+def test_poses_that_are_not_used_are_not_judged(moments, tmp_path):
     wrong = ["format.pose_direction=world_to_camera", "poses=estimated", "flow=exact"]
     code, _ = factorize(tmp_path, *wrong, "video=false")
     assert code == 0
@@ -200,7 +186,7 @@ def test_an_existing_output_is_not_overwritten(folder, tmp_path):
     ],
 )
 def test_a_recording_that_cannot_be_factorised_is_named_and_writes_nothing(
-    moments, tmp_path, diagnosed, overrides, named
+    moments, tmp_path, overrides, named
 ):
     path = tmp_path / "in/depth/0002.png"
     if named.startswith("depth"):
@@ -397,7 +383,7 @@ def test_a_still_camera_needs_neither_poses_nor_depth(tmp_path):
 
 
 @needs_7scenes
-def test_a_real_static_room_has_little_object_flow(tmp_path, diagnosed):
+def test_a_real_static_room_has_little_object_flow(tmp_path):
     options = ["stride=2", "stop=3", "video=false", "poses=estimated"]
     _, out = factorize(tmp_path, *options, source=SEVEN_SCENES, format="sevenscenes")
     (row,) = table(out)

@@ -20,7 +20,6 @@ from torchrl.envs import Compose, GymWrapper, TransformedEnv, check_env_specs
 
 from flowrep.geometry import rigid_flow
 from flowrep.pybullet import BulletCamera, BulletFlow
-from flowrep.scenes.scene import CameraConfig
 from flowrep.transforms import FlowFactorize, RawFlow
 from tests.running import run_python
 
@@ -98,12 +97,6 @@ def test_a_floor_seen_through_k_is_flat(world, camera):
         K = camera.K.copy()
         K[:2, 2] += shift
         assert abs(heights(depth, K, rolled)[near]).max() > 1e-3
-
-
-def test_a_streets_camera_has_the_same_k(world):
-    street = CameraConfig(61, 48, 58.0, 1.5, 0.0, 0.0, 0.2, 300.0)
-    camera = BulletCamera(world, 48, 61, fov_deg=58.0, near_m=0.2, far_m=300.0)
-    np.testing.assert_allclose(street.K, camera.K, rtol=1e-6)
 
 
 def test_where_nothing_was_drawn_depth_is_inf_though_the_buffer_is_not_1(world):
