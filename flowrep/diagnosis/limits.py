@@ -4,8 +4,10 @@ from __future__ import annotations
 
 # Errors of flow, and what estimated flow is wrong by on any surface: px, and share of its length.
 HARMLESS = 0.05, 0.05
+MATTERS = 3.0  # times that: a common error of which right data may not be suspected
 # Of measured flow: data are rounded.
 ROUNDED = 0.01, 0.005
+NOISE = 3.0  # times noise: what is below may be noise
 REST_PX = 0.25  # of flow: with less, a camera or a body is at rest
 MOST_NOISE = 0.25  # of flow's length: a larger error isn't taken for noise of sensors
 
@@ -14,6 +16,7 @@ MOST_NOISE = 0.25  # of flow's length: a larger error isn't taken for noise of s
 SURE = 25.0
 PAIR = 10.0  # nats at most that a pair counts for or against an explanation, of few pairs more
 ALIKE = 3.0  # nats, twenty to one: explanations whose scores differ by less are alike
+ALIKE_SHARE = 0.7  # of a vague one's nats: a mistake with a name explains as much
 
 FEW = 3  # frames or pairs: fewer may show anything by chance; and explanations that are told
 MANY = 0.2  # of all pairs or pixels: they matter

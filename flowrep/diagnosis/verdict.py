@@ -9,16 +9,13 @@ from typing import Any, Literal
 
 import torch
 
+from flowrep.diagnosis import limits
 from flowrep.diagnosis.competition import Competition
 from flowrep.diagnosis.explanation import Explanation
 from flowrep.diagnosis.fit import Pairs, length, median, middle, residuals
-from flowrep.diagnosis.limits import ALIKE, BODY, FEW, HARMLESS, MANY, MOST_NOISE, REST_PX, SURE
 from flowrep.diagnosis.pictures import best_of
 from flowrep.diagnosis.poses import most_noise_px
 from flowrep.diagnosis.rivals import Rival
-
-_ALIKE_SHARE = 0.7  # of a vague one's nats: a mistake with a name explains as much
-_NOISE = 3.0  # times the noise: differences below it may be noise
 
 
 @dataclass(frozen=True)
@@ -101,11 +98,11 @@ class _Case:
 
     def __init__(self, found: Competition) -> None:
         self.found, self.recorded, self.pairs = found, found.recorded, found.recorded.pairs
-        px, share = HARMLESS
+        px, share = limits.HARMLESS
         self.harmless_px = max(px, share * found.flow_px)
-        self.is_at_rest = max(found.flow_px, found.ego_px) < REST_PX
+        self.is_at_rest = max(found.flow_px, found.ego_px) < limits.REST_PX
         # At rest, there is no flow but that of poses' noise to be wrong.
-        self.unsure_px = REST_PX if self.is_at_rest else 3 * self.harmless_px
+        self.unsure_px = limits.REST_PX if self.is_at_rest else limits.MATTERS * self.harmless_px
         self.rough_px = max(most_noise_px(self.pairs, found.flow_px), self.harmless_px)
         self.noise_px = found.noise.typical_px
         self.effects_px = {each: each.effect_px(self.recorded) for each in found.others}
@@ -127,9 +124,9 @@ class _Case:
         return [
             px
             for each, px in self.effects_px.items()
-            if each.nats > self.recorded.nats - ALIKE
+            if each.nats > self.recorded.nats - limits.ALIKE
             and self.found.is_seen(each)
-            and px > _NOISE * noise.get(each.rival.subject, 0.0)
+            and px > limits.NOISE * noise.get(each.rival.subject, 0.0)
         ]
 
     def _diagnosis(self, verdict: Any, words: str, **more: Any) -> Diagnosis:
@@ -178,29 +175,31 @@ class _Case:
         """
         recorded, proven = self.recorded, [x for x in self.found.others if self.found.is_proven(x)]
         if recorded.poses is not None:
-            most_px = max(self.rough_px, MOST_NOISE * recorded.deviation_px)
+            most_px = max(self.rough_px, limits.MOST_NOISE * recorded.deviation_px)
             proven = [x for x in proven if x.deviation_px <= most_px]
         effects_px = self.effects_px
         matters = [effects_px[x] > (vague_px if x.rival.is_vague else least_px) for x in proven]
         sure = {x: x.sure_nats(recorded) for x, does in zip(proven, matters) if does}
         most = max(sure.values(), default=0.0)
-        ranked = sorted(sure, key=lambda each: (-min(sure[each], most - ALIKE), -each.nats))
+        ranked = sorted(sure, key=lambda each: (-min(sure[each], most - limits.ALIKE), -each.nats))
         named = [each for each in ranked if not each.rival.is_vague]
-        if named and sure[named[0]] > _ALIKE_SHARE * sure[ranked[0]]:
+        if named and sure[named[0]] > limits.ALIKE_SHARE * sure[ranked[0]]:
             ranked = named  # what is left may be a second mistake
-        if not ranked or min(sure[ranked[0]], ranked[0].nats - recorded.nats) <= SURE:
+        if not ranked or min(sure[ranked[0]], ranked[0].nats - recorded.nats) <= limits.SURE:
             return []
         first = ranked[0]
-        if any(x.sure_nats(first) > SURE for x, does in zip(proven, matters) if not does):
+        if any(x.sure_nats(first) > limits.SURE for x, does in zip(proven, matters) if not does):
             return []  # what is wrong, if anything, is something that changes nothing
         if first.rival.is_vague:
             return [first]
         # Those that pairs don't agree to be worse than the first.
-        alike = [x for x in named if first.sure_nats(x) <= ALIKE and sure[x] > 0]
+        alike = [x for x in named if first.sure_nats(x) <= limits.ALIKE and sure[x] > 0]
         alike = sorted(alike, key=lambda each: -each.nats)
         # Of those with one subject, the ones with more numbers than needed say nothing more.
         fewest = {e.rival.subject: len(e.n) for e in sorted(alike, key=lambda e: -len(e.n))}
-        return [each for each in alike if len(each.n) <= fewest[each.rival.subject] + 1][:FEW]
+        return [each for each in alike if len(each.n) <= fewest[each.rival.subject] + 1][
+            : limits.FEW
+        ]
 
     def of_poses(self, names: Sequence[str]) -> Diagnosis | None:
         """Returns the verdict if recorded motions aren't those of the pictures; adds notes."""
@@ -209,8 +208,8 @@ class _Case:
             return None
         deviation_px, resolution_px = self.recorded.deviation_px, self.recorded.systematic_px[1]
         # A body that is hidden in the noise pulls the world's motion by about as much.
-        least_px = max(self.unsure_px, _NOISE * self.noise_px)
-        has_rule = self.found.rule_nats > SURE and self.found.rule_px > least_px
+        least_px = max(self.unsure_px, limits.NOISE * self.noise_px)
+        has_rule = self.found.rule_nats > limits.SURE and self.found.rule_px > least_px
         if has_rule and not self.pairs.is_estimated:
             why = f"errors of poses follow a rule, {self.found.rule_px:.2g} px ({self.size})"
             return self._diagnosis("something is wrong", f"{why}, {self.unknown}")
@@ -219,17 +218,19 @@ class _Case:
             return self._diagnosis("something is wrong", f"{why} ({self.size}), {self.unknown}")
         # In directions that pixels don't determine, the nearest motion is as near as it likes.
         rest, left_px = length(residuals(self.pairs, self.pairs.motion)), _left_px(self.recorded)
-        fits = torch.where(rest.isnan(), math.nan, (rest < _NOISE * self.found.noise.px).double())
-        is_lost = fits.nanmean(-1)[is_world] < BODY
+        fits = torch.where(
+            rest.isnan(), math.nan, (rest < limits.NOISE * self.found.noise.px).double()
+        )
+        is_lost = fits.nanmean(-1)[is_world] < limits.BODY
         if is_lost.double().mean() > 0.5 and left_px > max(self.rough_px, least_px):
             why = f"hardly a pixel moves as recorded, {left_px:.2g} px are left"
             return self._diagnosis("something is wrong", f"{why} ({self.size}), {self.unknown}")
         off_px = poses.y.norm(dim=-1)
-        is_bad = poses.is_bad & is_world & (off_px > _NOISE * poses.sigma_px)
-        is_bad &= off_px > max(_NOISE * deviation_px, self.rough_px)
+        is_bad = poses.is_bad & is_world & (off_px > limits.NOISE * poses.sigma_px)
+        is_bad &= off_px > max(limits.NOISE * deviation_px, self.rough_px)
         bad = [name for name, is_one in zip(names, is_bad.tolist()) if is_one]
-        many = 0.5 if self.pairs.is_estimated else MANY  # an estimate fails in some pairs
-        if len(bad) >= max(FEW, many * len(names)):
+        many = 0.5 if self.pairs.is_estimated else limits.MANY  # an estimate fails in some pairs
+        if len(bad) >= max(limits.FEW, many * len(names)):
             why = f"poses of {len(bad)} in {len(names)} pairs don't fit: {', '.join(bad)}"
             if self.pairs.is_estimated:
                 return self._diagnosis("can't tell", f"{why}, or flow was estimated wrongly")
@@ -262,7 +263,7 @@ class _Case:
     def right(self) -> Diagnosis:
         """Returns the verdict if nothing speaks against the data."""
         outliers = 1 - self.recorded.own_share
-        if outliers > HARMLESS[1] and self.pairs.by_flow:
+        if outliers > limits.HARMLESS[1] and self.pairs.by_flow:
             note = f"{outliers:.0%} of pixels don't fit: they move, or depth is wrong there"
             self.notes.append(note)
         noise = f"({self.size}), beside noise of {self.noise_px:.2g} px"
