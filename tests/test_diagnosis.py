@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
 pytest.importorskip("cv2", reason="recordings need OpenCV")
 
@@ -107,6 +108,14 @@ def test_a_unit_by_which_all_is_far_away_explains_nothing():
     _, found, _ = outcome(drawn(74154), *mistaken(drawn(74154), 74154))
     assert "depth times 1.05e+03" in found.rivals_px
     assert not found.suspects
+
+
+def test_depth_that_half_of_the_pictures_lack_can_be_examined_without_poses():
+    right = drawn(ROOM)
+    depth = right.depth.copy()
+    depth[..., depth.shape[-1] // 2 :] = np.nan
+    found = examined(right.with_(depth=depth, poses=np.full_like(right.poses, np.nan)))
+    assert not found.is_wrong
 
 
 def test_most_poses_that_do_not_fit_estimated_flow_are_not_called_right():
@@ -281,6 +290,28 @@ def test_rows_and_ids_that_do_not_fit_the_bodies_are_told(frames):
     assert unseen.is_wrong or any("no pixel" in note for note in unseen.notes)
 
 
+@pytest.mark.parametrize("seed", [76276, 76424])  # at rest; halved
+def test_motions_of_bodies_that_leave_their_pixels_are_told(seed):
+    kind, found, _ = outcome(drawn(seed), *mistaken(drawn(seed), seed))
+    assert kind == "noticed"
+    assert found.words.startswith("instance_motion or ids don't fit the bodies")
+
+
+def test_half_a_picture_of_sky_is_no_noise_of_depth():
+    # A floor 0.4 m below the camera, seen below its horizon, and a wall 0.6 m to the left.
+    x, y = (torch.arange(60) - 29.5) / 50, (torch.arange(40)[:, None] - 19.5) / 50
+    ahead = [(1 + x / 2) / (4 - 0.1 * t) for t in range(8)]
+    inverse = [torch.where(y > 0.02, (y / 0.4).maximum(-x / 0.6).maximum(z), 0.0) for z in ahead]
+    motion = torch.eye(4)
+    motion[2, 3] = 0.1
+    sensor = {"depth": torch.stack(inverse)[:, None].reciprocal()}
+    sensor["prev_from_curr"] = motion.repeat(8, 1, 1)
+    K = torch.tensor([[50.0, 0.0, 30.0], [0.0, 50.0, 20.0], [0.0, 0.0, 1.0]])
+    found = diagnose(TensorDict({"sensor": sensor}, [8]), K)
+    assert found.is_right
+    assert found.error_px < 0.05
+
+
 def test_what_transforms_wrote_is_computed_again(frames):
     ego = spoilt(frames, ego=lambda flow: -flow)
     assert ego.is_wrong
@@ -289,6 +320,13 @@ def test_what_transforms_wrote_is_computed_again(frames):
     scaled = spoilt(frames, obj=lambda flow: 8 * flow)  # by its scale
     assert scaled.is_right
     assert any("8 times" in note for note in scaled.notes)
+
+
+def test_no_layout_is_advised_for_poses_that_are_matrices():
+    rivals = rivals_of({"pose_layout": "matrix"}, by_flow=True, of_flow=True, absolute=True)
+    assert {x.remedy for x in rivals if x.description.startswith("quaternions")} == {
+        "quaternions of wxyz", "quaternions of xyzw",
+    }  # fmt: skip
 
 
 def test_every_adapter_that_is_printed_for_an_env_can_be_made():

@@ -163,9 +163,12 @@ def rivals_of(
     table.append(Rival("depth", f"depth_kind={kind}", f"depth is {what}", change))
     if absolute:
         first, last = (_path(partial(_rolled, places)) for places in (-1, 1))
+        layout = given.get("pose_layout", "xyz_xyzw")
+        # An option can't mend matrices that were made of quaternions.
+        option = "pose_layout=xyz_" if "xyzw" in layout or "wxyz" in layout else "quaternions of "
         table += [
-            Rival("poses", "pose_layout=xyz_wxyz", "quaternions have w first", first),
-            Rival("poses", "pose_layout=xyz_xyzw", "quaternions have w last", last),
+            Rival("poses", f"{option}wxyz", "quaternions have w first", first),
+            Rival("poses", f"{option}xyzw", "quaternions have w last", last),
             Rival("poses", "rotations transposed", "rotations are by columns", _path(_transposed)),
         ]
     table += [

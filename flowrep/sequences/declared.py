@@ -105,7 +105,8 @@ class DeclaredRecording(Recording):
         left_out["in format.leave_out"] = np.isin(self._names, list(self.leave_out))
         self._choose(left_out)
         unit_m = self.depth_unit_m or files.stored_depth(self._depths[0], self.depth_coding)[1]
-        named = "pose_direction", "pose_axes", "depth_kind", "flow_direction", "flow_channels"
+        named = ["pose_layout", "pose_direction", "pose_axes", "depth_kind"]
+        named += ["flow_direction", "flow_channels"]
         self.conventions = {name: getattr(self, name) for name in named}
         self.conventions |= {"depth_unit_m": str(unit_m)}
 
