@@ -100,7 +100,9 @@ class _Case:
         self.found, self.recorded, self.pairs = found, found.recorded, found.recorded.pairs
         px, share = limits.HARMLESS
         self.harmless_px = max(px, share * found.flow_px)
-        self.is_at_rest = max(found.flow_px, found.ego_px) < limits.REST_PX
+        # Flow shows that; what depth shows best may be a wrong motion.
+        seen_px = found.flow_px if self.pairs.by_flow else max(found.flow_px, found.ego_px)
+        self.is_at_rest = seen_px < limits.REST_PX
         # At rest, there is no flow but that of poses' noise to be wrong.
         self.unsure_px = limits.REST_PX if self.is_at_rest else limits.MATTERS * self.harmless_px
         self.rough_px = max(most_noise_px(self.pairs, found.flow_px), self.harmless_px)
