@@ -240,7 +240,7 @@ def test_what_hardly_moves_or_is_hardly_known_tells_nothing():
                                  depth=right.depth[[0] * 10]))  # fmt: skip
     assert still.is_right  # there is no flow that could be wrong
     assert "9 of 9 pairs tell little: hardly anything moves" in still.notes
-    assert any("K and depth are not tested" in note for note in still.notes)
+    assert any("no convention is tested" in note for note in still.notes)
     unknown = right.depth.copy()
     unknown[:, 1:] = np.nan
     unknown[:, 0, 40:] = np.nan

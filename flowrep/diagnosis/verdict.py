@@ -273,7 +273,7 @@ class _Case:
             self.notes.append("poses, K and the unit of depth are not tested")
             return self._diagnosis("right", f"one motion explains raw flow and depth {noise}")
         if self.is_at_rest:
-            self.notes.append("the camera hardly moves: K and depth are not tested")
+            self.notes.append("the camera hardly moves: no convention is tested")
         parts = "raw flow, " * self.pairs.by_flow + "depth, K, the camera's motion"
         words = f"{parts} agree to within {self.error_px:.2g} px {noise}"
         words += f" and poses' {self.poses_px:.2g} px"
