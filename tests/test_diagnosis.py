@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from tensordict import TensorDict
 
 pytest.importorskip("cv2", reason="recordings need OpenCV")
@@ -130,6 +131,7 @@ def test_most_poses_that_do_not_fit_estimated_flow_are_not_called_right():
         ("depth in mm", NOISY), ("flow backward", ROOM), ("K of another size", ROOM),
         ("poses NED", STREET_ENV), ("depth in mm", STREET_ENV),
         ("depth upside down", 70156),  # where it was turned back, a third of it is unknown
+        ("K of another size", 76288),  # "depth moved" explains some of it
     ],
 )  # fmt: skip
 def test_a_listed_mistake_is_named(name, seed):
@@ -150,6 +152,16 @@ def test_an_offset_that_is_larger_than_depth_is_noticed():
     _, found, _ = outcome(drawn(76183), *mistaken(drawn(76183), 76183))
     assert found.is_wrong
     assert "depth has an offset" in found.words
+
+
+@pytest.mark.parametrize(("seed", "factor"), [(10, 57.3), (18, 1 / 57.3)])
+def test_rotations_in_another_unit_are_no_listed_mistake_that_explains_a_part_of_them(seed, factor):
+    right = drawn(seed)
+    turns = Rotation.from_matrix(right.poses[:, :3, :3]).as_rotvec()
+    wrong = right.poses.copy()
+    wrong[:, :3, :3] = Rotation.from_rotvec(factor * turns).as_matrix()
+    found = examined(right.with_(poses=wrong))
+    assert found.verdict == "something is wrong"
 
 
 def test_a_mistake_and_another_that_fits_as_well_are_told_together():
