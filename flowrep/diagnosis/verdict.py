@@ -168,8 +168,8 @@ class _Case:
     def _likeliest(self, least_px: float, vague_px: float) -> list[Explanation]:
         """Returns explanations that are better than the data as recorded for certain, and alike.
 
-        They matter, and leave little themselves, if more than noise, so that a second mistake may
-        be left, but no other one instead.
+        One that changes little, or that leaves more than noise and a quarter of what is left as
+        recorded, is not what is wrong.
 
         Args:
             least_px: what a mistake with a name has to change flow by.
@@ -199,9 +199,8 @@ class _Case:
         alike = sorted(alike, key=lambda each: -each.nats)
         # Of those with one subject, the ones with more numbers than needed say nothing more.
         fewest = {e.rival.subject: len(e.n) for e in sorted(alike, key=lambda e: -len(e.n))}
-        return [each for each in alike if len(each.n) <= fewest[each.rival.subject] + 1][
-            : limits.FEW
-        ]
+        simple = [each for each in alike if len(each.n) <= fewest[each.rival.subject] + 1]
+        return simple[: limits.FEW]
 
     def of_poses(self, names: Sequence[str]) -> Diagnosis | None:
         """Returns the verdict if recorded motions aren't those of the pictures; adds notes."""
