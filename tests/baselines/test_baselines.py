@@ -20,12 +20,12 @@ def test_the_commands_know_every_baseline():
 @pytest.mark.parametrize("speed", ["low", "normal", "high"])
 def test_the_planner_succeeds_and_never_turning_and_random_actions_seldom_do(drive, speed):
     assert [e.outcome for e in drive("planner", 5, speed=speed)] == ["success"] * 5
-    # With 30 episodes a true share of 12 % gives more than 9 in one run of 500.
-    straight = [e.outcome for e in drive("never_turn", 30, speed=speed)]
-    assert straight.count("success") <= 9
+    # With 60 episodes a true share of 12 % gives more than 15 in less than one run in 1,000.
+    straight = [e.outcome for e in drive("never_turn", 60, speed=speed)]
+    assert straight.count("success") <= 15
     assert set(straight) <= {"success", "collision"}
-    by_chance = [e.outcome for e in drive("random", 30, speed=speed)]
-    assert by_chance.count("success") <= 4
+    by_chance = [e.outcome for e in drive("random", 60, speed=speed)]
+    assert by_chance.count("success") <= 6
 
 
 def test_the_planner_replans_after_other_actions(make_street, empty_road):

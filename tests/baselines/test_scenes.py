@@ -159,9 +159,9 @@ def test_the_planner_succeeds_where_never_turning_and_random_actions_fail(drive,
     planned = [e.outcome for e in drive("planner", 2, name, speed=speed)]
     assert planned == ["success"] * 2
     # A bend ahead: straight on leads off the road or into somebody.
-    straight = [e.outcome for e in drive("never_turn", 6, name, speed=speed)]
+    straight = [e.outcome for e in drive("never_turn", 12, name, speed=speed)]
     assert straight.count("success") == 0
-    by_chance = [e.outcome for e in drive("random", 6, name, speed=speed)]
+    by_chance = [e.outcome for e in drive("random", 12, name, speed=speed)]
     assert by_chance.count("success") == 0
 
 

@@ -22,7 +22,7 @@ WRONG = {
     "an endless alias": (b"name: &a {b: *a}", ", line 1: an alias"),
     "a number of 401 digits": (b"a: 1" + b"0" * 400, ", line 1: a number"),
     "a number of 6,000 digits": (b"a: 0x1" + b"0" * 5000, ", line 1: a number"),
-    "depth": (b"name: " + b"[" * 2_000, ": is nested"),
+    "depth": (b"name: " + b"[" * 20_000, ": is nested"),
 }
 
 

@@ -235,9 +235,9 @@ def test_every_scene_has_a_pretrained_agent_of_at_most_three_megabytes():
 
 @pytest.mark.parametrize("scene", [pytest.param(s, marks=pytest.mark.slow) for s in SCENES])
 def test_a_pretrained_agent_drives_where_never_turning_fails(scene):
-    episodes = Agent.load("pretrained", scene=scene, device="cpu").evaluate(5, seed=0)
+    episodes = Agent.load("pretrained", scene=scene, device="cpu").evaluate(10, seed=0)
     # one that never turns drives Straight Road in one of ten episodes, the other scenes never
-    assert sum(each.outcome == "success" for each in episodes) >= 3
+    assert sum(each.outcome == "success" for each in episodes) >= 8
 
 
 def test_a_saved_agent_computes_in_the_faster_format_of_this_machine(monkeypatch):
