@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from operator import itemgetter
 from typing import NamedTuple
 
 import torch
@@ -60,21 +59,15 @@ def candidate(pairs: Pairs, rival: Rival, motion: Tensor, noise: Tensor) -> Cand
     every = torch.arange(count)
     half = every % 2 if count >= 4 else 0 * every
     group = every if rival.per_pair else half
-    spread, zeros = noise.new_tensor(rival.spread), noise.new_zeros(int(group.max()) + 1, k)
+    start, spread = min(starts, key=cost)[0], noise.new_tensor(rival.spread)
 
-    def fitted(start: Tensor) -> tuple[float, Tensor, Tensor]:
-        """Returns the cost of the numbers that the fit ends with, these, and by their prior."""
+    def numbers(m: Tensor) -> Tensor:
+        """Factors are fitted as their logarithms."""
+        return torch.where(start != 0, start * (spread * m).exp(), spread * m)
 
-        def numbers(m: Tensor) -> Tensor:
-            """Factors are fitted as their logarithms."""
-            return torch.where(start != 0, start * (spread * m).exp(), spread * m)
-
-        m, costs = gauss_newton(lambda m: residuals_of(numbers(m)), zeros, group, noise, steps=5)
-        return float(costs.sum()), numbers(m), m
-
-    # The start with the smallest residuals may lead astray.
-    likely = [each[0] for each in sorted(starts, key=cost)[:2]]
-    _, n, m = min(map(fitted, likely), key=itemgetter(0))
+    m = noise.new_zeros(int(group.max()) + 1, k)
+    m, _ = gauss_newton(lambda m: residuals_of(numbers(m)), m, group, noise, steps=5)
+    n = numbers(m)
     if rival.per_pair:
         # A frame's number is taken from the fit to the other pair that has this frame.
         follows, own = pairs.follows, n
