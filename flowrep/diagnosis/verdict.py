@@ -100,7 +100,7 @@ class _Case:
         self.found, self.recorded, self.pairs = found, found.recorded, found.recorded.pairs
         px, share = limits.HARMLESS
         self.harmless_px = max(px, share * found.flow_px)
-        # Flow shows that; what depth shows best may be a wrong motion.
+        # Flow shows whether it moves; the motion that fits depth best may be a wrong one.
         seen_px = found.flow_px if self.pairs.by_flow else max(found.flow_px, found.ego_px)
         self.is_at_rest = seen_px < limits.REST_PX
         # At rest, there is no flow but that of poses' noise to be wrong.
