@@ -70,9 +70,9 @@ gallery: $(INSTALLED)  ## Redraw the pictures of the documentation
 	done
 	$(BIN)/python -m docs.pictures docs/images
 
-# A process a core, one thread each. A file stays in one process, since its tests share what they
-# prepare; tests/conftest.py puts the files that take long first.
-PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses=auto --dist=loadfile --no-loadscope-reorder
+# A process a core, one thread each. Each starts with its half of the files, whose tests share what
+# they prepare, and takes over some of another's at the end; tests/conftest.py puts long ones first.
+PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses=auto --dist=worksteal
 
 test: $(DEVELOPED)  ## Run the tests
 	$(PYTEST) $(ARGS)

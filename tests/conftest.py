@@ -32,7 +32,7 @@ def pytest_configure():
 def pytest_collection_modifyitems(items):
     """Makes the cases after the first slow where a test says so, before `-m` looks.
 
-    Files with many slow tests come first: the last files that two processes share are short.
+    Files with many slow tests come first: what processes take over from one another is short.
     """
     seen = set()
     for item in items:

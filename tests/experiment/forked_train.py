@@ -1,8 +1,9 @@
-"""`python -m flowrep.train resume=...` in processes that the forkserver forks: imported once.
+"""`python -m flowrep.train resume=...` in processes that are forked, so that one has imported all.
 
 The tests kill these at a chosen instant.
 """
 
+import json
 import os
 import resource
 import signal
@@ -79,3 +80,12 @@ def carry_on(run, printed, kill_at=None, largest_file=None):
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
+
+
+if __name__ == "__main__":
+    # Forks a process for each line of arguments, and says its number, then its exit code.
+    for line in sys.stdin:
+        if not (child := os.fork()):
+            carry_on(**json.loads(line))
+        print(child, flush=True)
+        print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)

@@ -1,8 +1,12 @@
 """A run that is killed at any instant goes on, and ends as one that never was."""
 
-import multiprocessing
+import json
+import os
 import signal
+import subprocess
+import sys
 import time
+from contextlib import suppress
 
 import pytest
 
@@ -12,8 +16,8 @@ from flowrep.agent import load_checkpoint
 from flowrep.experiment.run import RunFolder
 from tests.comparing import differing
 from tests.config.composing import plain
-from tests.experiment.forked_train import carry_on as forked_train
 from tests.experiment.test_runner import without_clock
+from tests.running import ENVIRONMENT
 
 pytestmark = pytest.mark.slow
 
@@ -36,22 +40,29 @@ def new_run(path, algorithm="dsac"):
     return run
 
 
+@pytest.fixture(scope="module")
+def server():
+    """A process that forks others; not Python's forkserver, which has what workers import."""
+    command = [sys.executable, "-m", "tests.experiment.forked_train"]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, env=ENVIRONMENT, **pipes) as server:
+        yield server
+
+
 @pytest.fixture
-def carry_on(tmp_path, monkeypatch):
+def carry_on(tmp_path, server):
     """Continues a run in a process of its own; returns its exit code and what it printed."""
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["tests.experiment.forked_train"])
 
     def carry_on(run, kill_after_s=None, **how):
         printed = tmp_path / f"printed_{time.monotonic_ns()}"
-        process = context.Process(target=forked_train, args=(run.path, printed), kwargs=how)
-        process.start()
+        line = json.dumps({"run": str(run.path), "printed": str(printed), **how})
+        print(line, file=server.stdin, flush=True)
+        child = int(server.stdout.readline())
         if kill_after_s is not None:
-            process.join(kill_after_s)
-            process.kill()
-        process.join()
-        return process.exitcode, printed.read_text() if printed.exists() else ""
+            time.sleep(kill_after_s)
+            with suppress(ProcessLookupError):  # it has ended
+                os.kill(child, signal.SIGKILL)
+        return int(server.stdout.readline()), printed.read_text() if printed.exists() else ""
 
     return carry_on
 
