@@ -137,7 +137,7 @@ def announce(config: TrainConfig, settings: str) -> None:
     )
     if settings == "preset=paper" and device.type == "cpu" and config.total_frames >= 1_000_000:
         print(
-            f"{config.total_frames:,} frames with the paper's settings take two to four days; "
+            f"{config.total_frames:,} frames with the paper's settings take half a day or more; "
             "preset=laptop takes minutes"
         )
 
