@@ -1,7 +1,7 @@
 """The claims that claims.yaml declares, tested on stored runs.
 
-`flowrep.report.statistics` decides whether a claim holds. A run counts with its success rate over
-the episodes that all compared runs drove.
+`verdict_on` decides whether a claim holds, by `flowrep.report.statistics`. A run counts with its
+success rate over the episodes that all compared runs drove.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
