@@ -11,12 +11,13 @@ from itertools import cycle, pairwise, product
 from typing import Any, NamedTuple
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from flowrep.report.runs import SCENES, Curve, SuccessGrid, mean_curve
+from flowrep.report.runs import SCENES, Curve, SuccessGrid
 from flowrep.report.statistics import Estimate
 
 _TEXT, _FAINT = "#1b1f24", "#6b7480"
@@ -139,8 +140,7 @@ def draw_rates(grids: Sequence[SuccessGrid]) -> Figure:
 def draw_curves(panels: Sequence[tuple[str, Mapping[str, Sequence[Curve]]]]) -> Figure:
     """Returns learning curves, a panel per scene.
 
-    Bold lines are the mean of evaluations over seeds, thin lines the training episodes of each
-    seed.
+    Bold lines are the mean of evaluations over seeds, thin lines each seed's training episodes.
     """
     style = looks(list(dict.fromkeys(name for _, curves in panels for name in curves)))
 
@@ -154,6 +154,19 @@ def draw_curves(panels: Sequence[tuple[str, Mapping[str, Sequence[Curve]]]]) -> 
         axes.set_xlabel("frames (thousands)")
 
     return _panels(panels, draw, _line_handles(style))
+
+
+def mean_curve(curves: Sequence[Sequence[tuple[int, float]]]) -> list[tuple[int, float]]:
+    """Returns the mean over curves, at the frame counts that most of them have.
+
+    >>> mean_curve([[(10, 0.0), (20, 0.5)], [(10, 1.0), (20, 1.0)], [(10, 0.5)]])
+    [(10, 0.5), (20, 0.75)]
+    """
+    at: dict[int, list[float]] = {}
+    for frames, share in (point for curve in curves for point in curve):
+        at.setdefault(frames, []).append(share)
+    common = ((n, shares) for n, shares in sorted(at.items()) if 2 * len(shares) > len(curves))
+    return [(frames, float(np.mean(shares))) for frames, shares in common]
 
 
 def _panels(

@@ -399,16 +399,3 @@ def curve_of(run: Run) -> Curve:
     logged = zip(run.metrics.get("frames", ()), run.metrics.get("success", ()))
     training = [(int(frames), float(share)) for frames, share in logged if not np.isnan(share)]
     return Curve(sorted(evaluated.items()), training)
-
-
-def mean_curve(curves: Sequence[Sequence[tuple[int, float]]]) -> list[tuple[int, float]]:
-    """Returns the mean over curves, at the frame counts that most of them have.
-
-    >>> mean_curve([[(10, 0.0), (20, 0.5)], [(10, 1.0), (20, 1.0)], [(10, 0.5)]])
-    [(10, 0.5), (20, 0.75)]
-    """
-    at: dict[int, list[float]] = {}
-    for frames, share in (point for curve in curves for point in curve):
-        at.setdefault(frames, []).append(share)
-    common = ((n, shares) for n, shares in sorted(at.items()) if 2 * len(shares) > len(curves))
-    return [(frames, float(np.mean(shares))) for frames, shares in common]
