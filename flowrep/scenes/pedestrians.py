@@ -190,8 +190,8 @@ def draw_crowd(layout: Layout, speed_mps: Range, rng: np.random.Generator) -> Cr
     for group in layout.scene.pedestrian_groups:
         low, high = group.speed_mps or speed_mps
         draws = 1 if group.draw == "group" else group.count
-        # A uniform phase of the round trip also determines the direction. With `draw: group`,
-        # people share phase and speed, and start up to half of `spread_m` ahead or behind.
+        # A uniform phase of a round trip also sets the direction. With `draw: group`, people share
+        # phase and speed, up to `spread_m` / 2 ahead or behind. `check_walks` keeps starts free.
         phase = np.resize(rng.uniform(0.0, 1.0, draws), group.count)
         speed = np.resize(rng.uniform(low, high, draws), group.count)
         lateral = draw_lanes(group.count, group.spread_m, size, rng)

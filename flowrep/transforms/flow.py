@@ -210,8 +210,8 @@ class RawFlow(FlowTransform):
     Convention: p_t − p_t' on the current frame's grid, channels (u right, v down), t' the previous
     step (Eq. 1 of the paper). Row i of `instance_motion` `[*B, 1 + N, 4, 4]` takes a point fixed to
     instance i from the current camera's frame into the previous camera's, at the previous step; row
-    0 is the static world's. The observation thus holds everything that flow needs of the previous
-    step: no state is kept, and shuffled samples of a replay buffer give the same flow as the env.
+    0 is the static world's. At a reset nothing has moved, so flow is 0. No state is kept: shuffled
+    samples of a replay buffer give the same flow as the env.
 
     Where flow isn't known, because depth is `nan` or a point was not in front of the previous
     camera, raw is 0 and the mask beside it, `"raw_valid"`, is False. `FlowFactorize` reads both.
