@@ -43,9 +43,9 @@ def test_right_data_are_right(seed):
     assert found.error_px < 0.15 * found.raw_px
 
 
-def test_a_camera_that_is_backing_out_between_bodies_is_no_mistake_by_noisy_depth_alone():
-    assert drawn(48).kind[:3] == ("street", "backing", "env")
-    assert not found_of(drawn(48)).is_wrong
+@pytest.mark.parametrize("seed", [48, 79123])  # backing out between bodies; over a level floor
+def test_noisy_depth_alone_shows_no_mistake_in_right_data(seed):
+    assert not found_of(drawn(seed)).is_wrong
 
 
 def test_a_camera_at_rest_with_rough_poses_is_right_since_flow_is_noise():

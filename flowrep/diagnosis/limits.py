@@ -10,6 +10,8 @@ ROUNDED = 0.01, 0.005
 NOISE = 3.0  # times noise: what is below may be noise
 REST_PX = 0.25  # of flow: with less, a camera or a body is at rest
 MOST_NOISE = 0.25  # of flow's length: a larger error isn't taken for noise of sensors
+# Of what is left of depth as recorded: another motion leaves as much by noise that pixels share.
+ALIKE_LEFT = 0.85
 
 # Nats that an explanation has to be better by: 15 are the odds of a hundred thousand to one for one
 # of fifty rivals; noise that pixels share doubles what chance gives.

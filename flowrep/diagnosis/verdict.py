@@ -108,6 +108,8 @@ class _Case:
         self.rough_px = max(most_noise_px(self.pairs, found.flow_px), self.harmless_px)
         self.noise_px = found.noise.typical_px
         self.effects_px = {each: each.effect_px(self.recorded) for each in found.others}
+        self.left_px = _left_px(self.recorded)
+        self.best_px = median(middle(residuals(self.pairs, best_of(self.recorded.shown))))
         self.notes: list[str] = []
         # Flow's errors that are alike in all pictures, so that more pictures don't show them.
         is_biased = self.pairs.is_estimated
@@ -132,13 +134,16 @@ class _Case:
         ]
 
     def _diagnosis(self, verdict: Any, words: str, **more: Any) -> Diagnosis:
-        best_px = median(middle(residuals(self.pairs, best_of(self.recorded.shown))))
         width, others = self.pairs.now.shape[-1], self.found.others
         rivals_px = {each.rival.texts(each.n, width)[0]: _left_px(each) for each in others}
         return Diagnosis(
-            verdict, words, len(self.pairs.K), self.found.flow_px, _left_px(self.recorded), best_px,
+            verdict, words, len(self.pairs.K), self.found.flow_px, self.left_px, self.best_px,
             self.error_px, self.poses_px, rivals_px, notes=tuple(self.notes), **more,
         )  # fmt: skip
+
+    def _leaves_less(self, left_px: float) -> bool:
+        """Whether what is left of depth is clearly less than as recorded; flow's noise is known."""
+        return self.pairs.by_flow or left_px < limits.ALIKE_LEFT * self.left_px
 
     def of_a_likelier_explanation(
         self, instruction: Callable[[str, Pairs], str]
@@ -168,8 +173,8 @@ class _Case:
     def _likeliest(self, least_px: float, vague_px: float) -> list[Explanation]:
         """Returns explanations that are better than the data as recorded for certain, and alike.
 
-        One that changes little, or that leaves more than noise and a quarter of what is left as
-        recorded, is not what is wrong.
+        One that changes little, that leaves about as much, or more than noise and a quarter of how
+        far poses are off as recorded, is not what is wrong.
 
         Args:
             least_px: what a mistake with a name has to change flow by.
@@ -179,6 +184,7 @@ class _Case:
         if recorded.poses is not None:
             most_px = max(self.rough_px, limits.MOST_NOISE * recorded.deviation_px)
             proven = [x for x in proven if x.deviation_px <= most_px]
+        proven = [x for x in proven if self._leaves_less(_left_px(x))]
         effects_px = self.effects_px
         matters = [effects_px[x] > (vague_px if x.rival.is_vague else least_px) for x in proven]
         sure = {x: x.sure_nats(recorded) for x, does in zip(proven, matters) if does}
@@ -210,21 +216,22 @@ class _Case:
         deviation_px, resolution_px = self.recorded.deviation_px, self.recorded.systematic_px[1]
         # A body that is hidden in the noise pulls the world's motion by about as much.
         least_px = max(self.unsure_px, limits.NOISE * self.noise_px)
+        is_clear = self._leaves_less(self.best_px)
         has_rule = self.found.rule_nats > limits.SURE and self.found.rule_px > least_px
-        if has_rule and not self.pairs.is_estimated:
+        if has_rule and is_clear and not self.pairs.is_estimated:
             why = f"errors of poses follow a rule, {self.found.rule_px:.2g} px ({self.size})"
             return self._diagnosis("something is wrong", f"{why}, {self.unknown}")
-        if deviation_px > max(self.rough_px, least_px, 2 * resolution_px):
+        if is_clear and deviation_px > max(self.rough_px, least_px, 2 * resolution_px):
             why = f"the recorded motion is {deviation_px:.2g} px from that of the pictures"
             return self._diagnosis("something is wrong", f"{why} ({self.size}), {self.unknown}")
         # In directions that pixels don't determine, the nearest motion is as near as it likes.
-        rest, left_px = length(residuals(self.pairs, self.pairs.motion)), _left_px(self.recorded)
+        rest = length(residuals(self.pairs, self.pairs.motion))
         fits = torch.where(
             rest.isnan(), math.nan, (rest < limits.NOISE * self.found.noise.px).double()
         )
         is_lost = fits.nanmean(-1)[is_world] < limits.BODY
-        if is_lost.double().mean() > 0.5 and left_px > max(self.rough_px, least_px):
-            why = f"hardly a pixel moves as recorded, {left_px:.2g} px are left"
+        if is_lost.double().mean() > 0.5 and self.left_px > max(self.rough_px, least_px):
+            why = f"hardly a pixel moves as recorded, {self.left_px:.2g} px are left"
             return self._diagnosis("something is wrong", f"{why} ({self.size}), {self.unknown}")
         off_px = poses.y.norm(dim=-1)
         is_bad = poses.is_bad & is_world & (off_px > limits.NOISE * poses.sigma_px)
