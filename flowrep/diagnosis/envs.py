@@ -97,7 +97,7 @@ def diagnose(
     names = [str(index) for index in kept[testable].tolist()]
     result = judged(Competition(pairs.select(testable), rivals), names, _adapter_call)
     faults, odd = _recomputed(seen, ego_key, obj_key)
-    kind, of_bodies = ("", "") if result.is_wrong else _bodies(seen)
+    kind, of_bodies = ("", "") if result.is_wrong else _bodies(seen, result.left_px)
     odd += recordings.note_on_untested(reasons)
     odd += [of_bodies] * (kind == "untested")
     result = replace(result, notes=(*result.notes, *odd))
@@ -235,10 +235,11 @@ def _recomputed(seen: _Seen, ego_key: str, obj_key: str) -> tuple[list[str], lis
     return faults, odd
 
 
-def _bodies(seen: _Seen) -> tuple[str, str]:
+def _bodies(seen: _Seen, world_px: float) -> tuple[str, str]:
     """Returns "fault", "untested" or "" of bodies' ids and motions, and the reason.
 
-    Each body of each frame is judged as the camera is, by its pixels and the depth before.
+    Each body of each frame is judged as the camera is, by its pixels and the depth before. The
+    world's residual `world_px`, of the camera's poses, is no fault of a body's.
     """
     count, ids = seen.rows.shape[1], seen.ids[:, 0]
     unseen = "no moving body is seen: ids and motions of bodies are not tested"
@@ -282,7 +283,7 @@ def _bodies(seen: _Seen) -> tuple[str, str]:
     names = [f"body {i}" for i in body[testable].tolist()]
     found = judged(Competition(pairs.select(testable), []), names, _adapter_call)
     px, share = limits.HARMLESS
-    if found.is_wrong and found.left_px > px + share * found.raw_px:
+    if found.is_wrong and found.left_px > world_px + px + share * found.raw_px:
         left = f"{found.left_px:.2g} px are left, {found.best_px:.2g} px by other motions"
         return "fault", f"instance_motion or ids don't fit the bodies: {left}"
     if not found.is_right:
