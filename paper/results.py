@@ -654,9 +654,9 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
     def in_its_scenes(study: str) -> list[Claim]:
         return claims_of({**declared, "scenes": [*studies[study]]}, studies, study)[0]
 
-    def beside(study: str, second: str, weights: Mapping[Any, int]) -> str:
+    def beside(study: str, second: str, weights: Mapping[Any, int], *scenes: str) -> Contrast:
         asked = {"first": "ego+obj", "second": second, "expect": "more", "success": weights}
-        return effect_text(contrast_of(asked, studies[study], [*studies[study]]))
+        return contrast_of(asked, studies[study], scenes or [*studies[study]])
 
     every = [run for of in main.values() for run in of]
     asked = [contrast.asked for claim in primary for contrast in claim.contrasts]
@@ -704,8 +704,11 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
             cells={cell.title: cell_table(cell) for cell in cells},
             held_out_figure=HELD_OUT_FIGURE,
             # row 14 against the paper's other stack of two frames, row 19 at each speed alone
-            against_depth=beside("frame_rate", "depth2", {12: 1, 6: -1}),
-            alone={speed: beside("wide_confirmation", "raw", {speed: 1}) for speed in SPEEDS},
+            against_depth=effect_text(beside("frame_rate", "depth2", {12: 1, 6: -1})),
+            alone={
+                speed: effect_text(beside("wide_confirmation", "raw", {speed: 1}))
+                for speed in SPEEDS
+            },
             learned=learned_table(learned),
             learned_contrasts=learned_contrasts(learned),
             lead=[
@@ -723,6 +726,11 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, dict[
             figure=FIGURE,
             length_figure=LENGTH_FIGURE,
             length_decides=bool(long),
+            early=_points(beside("laptop", "raw", {"normal": 1}, "straight_road")),
+            at_length={row: _points(contrast) for row, contrast in long.items()},
+            length_seeds=min(
+                (int(c.effect.freedom) + 1 for c in long.values() if c.effect), default=0
+            ),
             length=length_table(at_that_length) if at_that_length else "",
             length_contrasts=length_contrasts([*primary, *secondary], long),
             length_held_out={
