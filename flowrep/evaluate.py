@@ -101,6 +101,7 @@ def evaluate_one(
     stop: StopRequest,
 ) -> None:
     """Runs an agent's episodes, keeps whole groups even if interrupted."""
+    from flowrep.envs.torchrl_env import usable_device
     from flowrep.experiment import build
     from flowrep.experiment.evaluation import PairedEvaluation
     from flowrep.experiment.outcomes import print_results
@@ -108,7 +109,7 @@ def evaluate_one(
     agent, folder = candidate.load(), candidate.folder
     folder.read_episodes()  # a damaged table is refused before hours of episodes, not after
     if not config.other_policies:  # whose networks may be large
-        build.share_cores(agent.config)
+        build.share_cores(usable_device(agent.config.device), agent.config.flow)
     origin = agent.origin("evaluate")
     # Agents of one scene share the baselines' episodes.
     rates = config.fps or [agent.config.scene.frame_rate_hz]

@@ -45,7 +45,7 @@ class EarlyCheck(Callback):
             if model.resume is None:
                 from flowrep.experiment import build
 
-                build.check(model)
+                build.resolved(model)
         except Exception as error:  # Hydra would print a warning and go on
             end_with(error)
 
@@ -120,11 +120,11 @@ def announce(config: TrainConfig, settings: str) -> None:
     """Prints what is trained on which device, and on a CPU how long the paper's settings take."""
     import torch
 
+    from flowrep.envs.torchrl_env import usable_device
     from flowrep.envs.workers import available_cores
-    from flowrep.experiment import build
     from flowrep.experiment.provenance import cpu_name
 
-    device = build.device(config.device)
+    device = usable_device(config.device)
     where = torch.cuda.get_device_name(device) if device.type == "cuda" else cpu_name()
     cores = f", {available_cores()} cores" if device.type == "cpu" else ""
     maps, algorithm = ",".join(config.representations), config.algorithm.target.rpartition(".")[2]
@@ -152,11 +152,11 @@ def run_in_folder(config: TrainConfig, folder: RunFolder) -> None:
     from flowrep.experiment import build
     from flowrep.experiment.runner import Runner
 
-    build.check(config)
+    config = build.resolved(config)
     how_to_go_on = line_for("train", resume=str(folder.path))
     with StopRequest() as stop, closing(Runner(config, folder)) as runner:
         if config.resume is None:
-            folder.write_config(runner.config.plain())
+            folder.write_config(config.plain())
         else:
             runner.load()
             folder.write_total_frames(config.total_frames)

@@ -1,10 +1,8 @@
 """Every file of conf/ composes, and everything in it is used."""
 
 import inspect
-from unittest.mock import Mock
 
 import pytest
-import torch
 
 from flowrep.config import config_groups, group_choices
 from tests.config.composing import composed, plain
@@ -63,31 +61,6 @@ def test_a_preset_asks_of_one_algorithm_what_others_do_not_have():
     assert "n_steps" not in algorithm("preset=laptop", "algorithm=ppo")
     # the command line has the last word
     assert algorithm("preset=laptop", "algorithm.n_steps=2")["n_steps"] == 2
-
-
-@pytest.mark.parametrize(
-    ("cores", "device", "change", "workers"),
-    [
-        (1, "cpu", "motion=exact", 0),
-        (2, "cpu", "threads=1", 1),
-        (2, "cpu", "threads=2", 0),
-        (2, "cpu", "num_workers=2", 2),
-        (2, "cuda", "motion=exact", 2),
-        (3, "cpu", "threads=1", 2),
-        (16, "cpu", "threads=1", 4),  # one for each environment
-    ],
-)
-def test_workers_step_environments_where_cores_are_free(
-    monkeypatch, cores, device, change, workers
-):
-    from flowrep.experiment import build
-
-    made = Mock()
-    monkeypatch.setattr(build, "make_env", made)
-    monkeypatch.setattr("flowrep.envs.workers.available_cores", lambda: cores)
-    monkeypatch.setattr(build, "device", torch.device)
-    build.env(composed(change, "num_envs=4", "algorithm.batch_size=64", f"device={device}"))
-    assert made.call_args.kwargs["num_workers"] == workers
 
 
 @pytest.mark.parametrize(("scene", "mirrors"), [("three_way_junction", True), ("s_turn", False)])

@@ -18,6 +18,7 @@ from flowrep.config.usage import UsageError
 from flowrep.envs import WorkerError, workers
 from flowrep.evaluate import candidates_of
 from flowrep.evaluate import run as evaluate
+from flowrep.experiment import build
 from flowrep.experiment.agents import Agent
 from flowrep.experiment.evaluation import BaselinePolicy, PairedEvaluation
 from flowrep.experiment.policies import PolicyError
@@ -36,10 +37,10 @@ SMALL = ["scene.camera.height_px=24", "scene.camera.width_px=24"]
 
 def saved(path, *overrides):
     """A run that saved its checkpoint before the first frame; its episodes are short."""
-    config = composed("debug=smoke", "device=cpu", SHORT, *overrides)
+    config = build.resolved(composed("debug=smoke", "device=cpu", SHORT, *overrides))
     folder = RunFolder(path)
     runner = Runner(config, folder)
-    folder.write_config(runner.config.plain())
+    folder.write_config(config.plain())
     runner.observation = runner.env.reset()
     runner.save()
     runner.close()

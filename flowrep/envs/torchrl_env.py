@@ -25,11 +25,13 @@ from flowrep.transforms.representations import FLOWS, DropKeys, Representations
 
 
 def usable_device(device: str | torch.device) -> torch.device:
-    """Returns a device, after a check that tensors can be created on it.
+    """Returns a device on which tensors can be created; "auto" is CUDA's if there is one.
 
     Raises:
         ValueError: there is no such device, or this PyTorch can't use it.
     """
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         return torch.empty(0, device=device).device
     except (RuntimeError, TypeError, AssertionError) as error:  # the last: built without CUDA
@@ -90,7 +92,7 @@ def make_env(
         num_envs: the batch size.
         num_workers: number of processes that step the envs, see `WorkerVectorEnv`; 0 steps them in
             this process. The results are the same.
-        device: device of the TensorDicts; streets are simulated on the CPU.
+        device: device of the TensorDicts, see `usable_device`; streets are simulated on the CPU.
         speed: see `StreetEnv`, as for `frame_rate_hz` and `picture_scale`.
         seed: the seed from which the envs draw their episodes; with None, call `set_seed`.
         keep_sensor: whether to keep the ("sensor", ...) keys; rgb and frame are kept only if a
@@ -157,19 +159,19 @@ def make_env(
     return env
 
 
-def make_mirror(
-    scene: str | Path | Mapping[str, Any] | Scene, representations: str | Iterable[str]
-) -> Mirror:
+def make_mirror(env: TransformedEnv, representations: str | Iterable[str]) -> Mirror:
     """Returns the transform that replaces half of a replay batch by mirror images.
 
     Args:
-        scene: as for `make_env`; its camera determines which columns mirror each other.
+        env: made by `make_env`; its camera determines which columns mirror each other.
         representations: the key of a map, or several keys, as in `make_env`.
 
-    >>> make_mirror("straight_road", ["ego", "seg2"]).swapped_actions
+    >>> env = make_env("straight_road", ["ego", "seg2"])
+    >>> make_mirror(env, ["ego", "seg2"]).swapped_actions
     tensor([0, 2, 1])
+    >>> env.close()
     """
-    names, K = as_keys(representations), load_scene(scene).camera.K
+    names, K = as_keys(representations), env.base_env.scene.camera.K
     flows = [name for name in names if name in FLOWS]
     swapped = [YAW_SIGN.index(-sign) for sign in YAW_SIGN]
     return Mirror(names, flow_keys=flows, swapped_actions=swapped, intrinsics=K.tolist())

@@ -61,7 +61,7 @@ class Agent(Driver):
         if "resume" in overrides:
             raise UsageError("resume=: continue a run with python -m flowrep.train resume=<folder>")
         config, default = composed(TrainConfig, overrides)
-        build.check(config)
+        config = build.resolved(config)
         run = RunFolder(default if folder is None else folder)
         run.check_is_new()
         with (
@@ -70,11 +70,11 @@ class Agent(Driver):
             torch_threads(torch.get_num_threads()),  # the caller's again afterwards
             closing(Runner(config, run, on_log=callback)) as runner,
         ):
-            run.write_config(runner.config.plain())
+            run.write_config(config.plain())
             runner.train(stop)
         if stop:
             raise KeyboardInterrupt(f"stopped after {runner.frames} frames; saved in {run.path}")
-        return cls(runner.agent.policy, runner.config, runner.frames, config.scene)
+        return cls(runner.agent.policy, config, runner.frames, config.scene)
 
     @classmethod
     def load(

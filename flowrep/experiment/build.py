@@ -1,4 +1,4 @@
-"""Builds what a config describes: env, agent, policy, device. Modules below see no config."""
+"""Builds what a config describes: env, agent, policy. Modules below see no config."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase, InitTracker, Transform
 from flowrep.agent import Algorithm
 from flowrep.agent.precision import resolved_precision
 from flowrep.config.algorithms import ALGORITHMS, AlgorithmOptions
-from flowrep.config.options import validated
+from flowrep.config.options import FlowOptions, validated
 from flowrep.config.usage import UsageError
 from flowrep.envs import make_env, make_mirror
 from flowrep.envs.torchrl_env import usable_device
@@ -23,73 +23,60 @@ from flowrep.experiment.schema import EnvConfig, TrainConfig
 from flowrep.transforms import representation_stack
 
 
-def device(name: str) -> torch.device:
-    """Returns the named device; "auto" is a CUDA device if there is one, else the CPU."""
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    return usable_device(name)
-
-
 def env(config: EnvConfig, **changes: Any) -> EnvBase:
     """Returns the env that the config describes; `changes` replace arguments of `make_env`.
 
-    Observations include `is_init`, by which the replay memory sees that an episode begins.
+    Without `num_workers`, which differs between training and evaluation, it has none. Observations
+    include `is_init`, by which the replay memory sees that an episode begins.
     """
-    num_envs = changes.get("num_envs", config.num_envs)
-    num_workers = changes.get("num_workers", config.num_workers)
-    if num_workers == "auto":
-        on_cpu = device(config.device).type == "cpu"  # where updates need cores of their own
-        busy = config.threads if isinstance(config, TrainConfig) and on_cpu else 0
-        num_workers = worker_count(num_envs, busy)
     arguments: dict[str, Any] = {
         "scene": config.scene,
         "representations": config.representations,
         "flow": dict(config.flow),
         "motion": config.motion,
         "noise": config.noise,
-        "num_envs": num_envs,
-        "device": device(config.device),
+        "num_envs": config.num_envs,
+        "device": config.device,
         "speed": config.speed,
     }
-    arguments |= changes | {"num_workers": num_workers}
+    arguments |= changes
     maps = arguments["representations"]
     arguments["representations"] = {name: _described(name, maps[name]) for name in maps}
     return make_env(**arguments).append_transform(InitTracker())
 
 
-def training(config: TrainConfig) -> tuple[TrainConfig, EnvBase, Algorithm]:
-    """Returns a training's config as it runs on this machine, its env and its agent, untrained."""
-    config = with_precision(config)
-    share_cores(config)
+def training(config: TrainConfig) -> tuple[EnvBase, Algorithm]:
+    """Returns the env and the untrained agent of a config that `resolved` returned."""
+    device = usable_device(config.device)
+    share_cores(device, config.flow)
     torch.manual_seed(config.seed)
-    streets = env(config, compiled=config.compiled)
+    workers = training_workers(config, device)
+    streets = env(config, num_workers=workers, compiled=config.compiled)
     # Env i draws its episodes from seed · num_envs + i: runs of two seeds share none.
     streets.set_seed(config.seed * config.num_envs)
     # TorchRL's storage starts multiprocessing's resource tracker, which a SIGHUP would end.
     with sheltered():
-        return config, streets, agent(config, streets)
+        return streets, agent(config, streets)
 
 
 def agent(config: TrainConfig, env: EnvBase) -> Algorithm:
-    """Returns the config's algorithm, untrained, for the env's specs."""
-    maker, options = algorithm(config.algorithm)
-    images = {}
+    """Returns the config's algorithm, untrained, for the env's specs and on its device."""
+    maker, specs, options, run = _task(config, env)
     if getattr(options, "mirror", False):
-        images["mirror_image"] = make_mirror(env.base_env.scene, config.representations)
-    specs, run = _task(config, env)
-    return maker(*specs, options, **run, **images)
+        run["mirror_image"] = make_mirror(env, config.representations)
+    return maker(*specs, options, **run)
 
 
 def policy(config: TrainConfig, env: EnvBase) -> Any:
     """Returns the config's policy, untrained, without the rest of the agent."""
-    maker, options = algorithm(config.algorithm)
-    specs, run = _task(config, env)
+    maker, specs, options, run = _task(config, env)
     return maker.make_policy(*specs, options, **run)
 
 
-def _task(config: TrainConfig, env: EnvBase) -> tuple[tuple[Any, ...], dict[str, Any]]:
+def _task(config: TrainConfig, env: EnvBase) -> tuple[Any, tuple[Any, ...], Any, dict[str, Any]]:
+    maker, options = algorithm(config.algorithm)
     specs = env.observation_spec, env.action_spec, list(config.representations)
-    return specs, {"total_frames": config.total_frames, "device": device(config.device)}
+    return maker, specs, options, {"total_frames": config.total_frames, "device": env.device}
 
 
 def algorithm(section: AlgorithmOptions) -> tuple[Any, Any]:
@@ -101,13 +88,14 @@ def algorithm(section: AlgorithmOptions) -> tuple[Any, Any]:
     return maker, validated(whole, {"algorithm": section.plain()}).algorithm
 
 
-def check(config: TrainConfig) -> None:
-    """Checks, before a run has a folder, what needs PyTorch to be checked.
+def resolved(config: TrainConfig) -> TrainConfig:
+    """Returns a config that names the number format in which this machine computes.
 
-    That is the device and the number of threads, the classes that are named, and all options that
-    the algorithm and the transforms of maps, flow and noise take.
+    A run stores it and keeps that format on any machine; its device and workers may stay "auto".
+    Before, what needs PyTorch is checked: device and threads, the classes that are named, and all
+    options that the algorithm and the transforms of maps, flow and noise take.
     """
-    device(config.device)
+    device = usable_device(config.device)
     if config.threads > (cores := available_cores()):
         raise UsageError(f"threads={config.threads} on {cores} cores: give {cores} or fewer")
     algorithm(config.algorithm)[1].first_update(config.num_envs)
@@ -122,6 +110,7 @@ def check(config: TrainConfig) -> None:
         )
     except ValueError as error:
         raise UsageError(f"representations, flow or noise: {error}") from error
+    return with_precision(config, device)
 
 
 def _described(name: str, options: Mapping[str, Any] | None) -> Any:
@@ -153,29 +142,39 @@ def _class(key: str, target: str, base: type) -> Any:
     return named
 
 
-def with_precision(config: TrainConfig, precision: str | None = None) -> TrainConfig:
-    """Returns a config with this precision, or its own; "auto" is replaced by this machine's."""
+def with_precision(
+    config: TrainConfig, device: torch.device, precision: str | None = None
+) -> TrainConfig:
+    """Returns a config with this precision, or its own; "auto" is replaced by the device's."""
     section = config.algorithm
     _, options = algorithm(section)
     if not hasattr(options, "precision"):  # of a user's algorithm
         return config
     name = options.precision if precision is None else precision
-    chosen = {"precision": resolved_precision(name, device(config.device))}
+    chosen = {"precision": resolved_precision(name, device)}
     return config.model_copy(update={"algorithm": section.model_copy(update=chosen)})
 
 
-def share_cores(config: EnvConfig) -> None:
+def share_cores(device: torch.device, flow: FlowOptions) -> None:
     """Limits this process to one thread on a CPU, except for updates and estimated flow.
 
     Nothing else is large enough to gain from a second thread. If another program is busy, threads
     that wait for each other make a step take up to a hundred times as long.
     """
-    if device(config.device).type == "cpu" and config.flow.source == "exact":
+    if device.type == "cpu" and flow.source == "exact":
         torch.set_num_threads(1)
+
+
+def training_workers(config: TrainConfig, device: torch.device) -> int:
+    """Returns the number of processes that step a training's envs."""
+    if config.num_workers != "auto":
+        return config.num_workers
+    # On a CPU, updates need cores of their own.
+    return worker_count(config.num_envs, config.threads if device.type == "cpu" else 0)
 
 
 def evaluation_workers(config: EnvConfig, num_envs: int) -> int:
     """Returns the number of processes that step an evaluation's environments."""
-    if isinstance(config.num_workers, int):
+    if config.num_workers != "auto":
         return min(config.num_workers, num_envs)
     return worker_count(num_envs // ENVS_PER_WORKER)

@@ -117,8 +117,8 @@ class TrainedPolicy(NamedPolicy):
                     )
             given["scene"] = replace(given["scene"], **seen)
         config = trained.model_copy(update=given)
-        config = build.with_precision(config, precision or self.precision)
-        with closing(build.env(config, num_envs=1, num_workers=0)) as street:
+        with closing(build.env(config, num_envs=1)) as street:
+            config = build.with_precision(config, street.device, precision or self.precision)
             policy = build.policy(config, street)
         try:
             policy.load_state_dict(unpacked(state["policy"]))
@@ -299,7 +299,7 @@ class ForeignPolicy(NamedPolicy):
         if not given.get("representations"):
             raise UsageError(f"representations needs a value for policy={self.name}")
         config = _env_config(given)
-        with closing(build.env(config, num_envs=1, num_workers=0)) as street:
+        with closing(build.env(config, num_envs=1)) as street:
             maps = {name: street.observation_spec[name][0] for name in config.representations}
             task = Task(
                 scene=config.scene.name,
@@ -307,7 +307,7 @@ class ForeignPolicy(NamedPolicy):
                 observation_spec=Composite(maps),
                 action_spec=street.action_spec[0],
                 intrinsics=torch.from_numpy(street_envs(street)[0].K),
-                device=build.device(config.device),
+                device=street.device,
             )
         return self.built_for(task), config, 0, None
 

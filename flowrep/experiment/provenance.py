@@ -9,12 +9,9 @@ import shutil
 import subprocess
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from flowrep import __version__
-
-if TYPE_CHECKING:
-    import torch
 
 _DEFINING_KEYS = (
     "scene", "representations", "flow", "motion", "noise", "algorithm", "speed", "seed", "num_envs",
@@ -59,7 +56,7 @@ def flattened(config: Mapping[str, Any], section: str = "") -> dict[str, Any]:
     return flat
 
 
-def machine_of(precision: torch.dtype) -> dict[str, Any]:
+def machine_of(precision: str) -> dict[str, Any]:
     """Returns versions, commit, processor and number format, which may change a run's numbers."""
     import torch
 
@@ -74,7 +71,7 @@ def machine_of(precision: torch.dtype) -> dict[str, Any]:
         "commit": commit,
         "torch": torch.__version__,
         "python": platform.python_version(),
-        "precision": str(precision).removeprefix("torch."),
+        "precision": {"bf16": "bfloat16", "fp32": "float32"}[precision],
         "cpu": cpu_name(),
         "cores": os.cpu_count(),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,

@@ -23,7 +23,7 @@ from flowrep.agent import (
     save_checkpoint,
     torch_threads,
 )
-from flowrep.agent.precision import compute_dtype, has_bf16
+from flowrep.agent.precision import has_bf16
 from flowrep.envs import WorkerError, begin_step, get_states, has_spare_cores, set_states
 from flowrep.experiment import build
 from flowrep.experiment.evaluation import (
@@ -62,17 +62,16 @@ class Runner:
 
     def __init__(
         self,
-        config: TrainConfig,
+        config: TrainConfig,  # as `build.resolved` returned it
         folder: RunFolder,
         on_log: Callable[[dict[str, float]], Any] | None = None,  # gets each row of metrics.csv
     ) -> None:
         self.folder, self.clock, self.on_log = folder, Stopwatch(), on_log
         logging.getLogger("torchrl").setLevel(logging.WARNING)  # it logs every storage it creates
         keep_freed_memory()
-        self.config, self.env, self.agent = build.training(config)
-        precision = getattr(config.algorithm, "precision", "fp32")
-        machine = machine_of(compute_dtype(precision, self.agent.device))
-        self.machine = machine | {"threads": config.threads}
+        self.config, (self.env, self.agent) = config, build.training(config)
+        precision = getattr(config.algorithm, "precision", "fp32")  # not an option of every one
+        self.machine = machine_of(precision) | {"threads": config.threads}
         self.frames = 0  # of all envs, so far
         self.observation: TensorDictBase | None = None  # for the next action
         self.evaluation_pending = False  # whether a stop interrupted the last one

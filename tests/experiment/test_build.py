@@ -3,6 +3,7 @@
 import sys
 
 import pytest
+import torch
 
 pytest.importorskip("pybullet", reason="a run is built with the simulator")
 
@@ -10,7 +11,7 @@ from flowrep.agent import DoubleDQN, precision
 from flowrep.config.algorithms import ALGORITHMS
 from flowrep.config.usage import UsageError
 from flowrep.experiment import build
-from flowrep.experiment.build import algorithm, evaluation_workers, with_precision
+from flowrep.experiment.build import algorithm
 from flowrep.experiment.schema import ForeignAlgorithm
 from tests.config.composing import composed
 
@@ -57,7 +58,8 @@ def test_a_new_run_s_config_says_in_which_format_it_computes(monkeypatch, faster
 
     def stored(section):
         config = composed("device=cpu").model_copy(update={"algorithm": section})
-        return with_precision(config).plain()["algorithm"].get("precision")
+        resolved = build.with_precision(config, torch.device("cpu"))
+        return resolved.plain()["algorithm"].get("precision")
 
     section = composed("device=cpu").algorithm
     assert section.precision == "auto"
@@ -88,6 +90,26 @@ def test_a_target_that_is_no_algorithm_is_refused(target, options, says):
 
 
 @pytest.mark.parametrize(
+    ("cores", "device", "change", "workers"),
+    [
+        (1, "cpu", "motion=exact", 0),
+        (2, "cpu", "threads=1", 1),
+        (2, "cpu", "threads=2", 0),
+        (2, "cpu", "num_workers=2", 2),
+        (2, "cuda", "motion=exact", 2),
+        (3, "cpu", "threads=1", 2),
+        (16, "cpu", "threads=1", 4),  # one for each environment
+    ],
+)
+def test_workers_step_a_training_s_envs_where_cores_are_free(
+    monkeypatch, cores, device, change, workers
+):
+    monkeypatch.setattr("flowrep.envs.workers.available_cores", lambda: cores)
+    config = composed(change, "num_envs=4", "algorithm.batch_size=64")
+    assert build.training_workers(config, torch.device(device)) == workers
+
+
+@pytest.mark.parametrize(
     ("cores", "asked", "num_envs", "workers"),
     [
         (2, "auto", 96, 2),
@@ -104,7 +126,7 @@ def test_an_evaluation_is_stepped_by_a_process_a_core_if_each_has_enough_to_do(
 ):
     monkeypatch.setattr("flowrep.envs.workers.available_cores", lambda: cores)
     config = composed("device=cpu").model_copy(update={"num_workers": asked})
-    assert evaluation_workers(config, num_envs) == workers
+    assert build.evaluation_workers(config, num_envs) == workers
 
 
 @pytest.mark.parametrize(
@@ -122,4 +144,4 @@ def test_an_evaluation_is_stepped_by_a_process_a_core_if_each_has_enough_to_do(
 def test_what_a_transform_or_a_machine_refuses_is_named_before_a_run_has_a_folder(line):
     key = line.split()[0].partition("=")[0].rpartition(".")[2].lstrip("+")
     with pytest.raises(ValueError, match=key):
-        build.check(composed(*line.split()))
+        build.resolved(composed(*line.split()))

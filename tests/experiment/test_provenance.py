@@ -4,7 +4,6 @@ import copy
 from pathlib import Path
 
 import pytest
-import torch
 
 from flowrep.agent import CheckpointError
 from flowrep.experiment.provenance import check_origin, machine_of, origin_of
@@ -52,4 +51,4 @@ def test_another_version_is_refused(config):
 
 def test_a_clone_on_a_machine_without_git_has_no_commit(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert machine_of(torch.float32)["commit"] is None
+    assert machine_of("fp32")["commit"] is None

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from flowrep.experiment.outcomes import COLUMNS, EpisodeRecord
@@ -126,7 +125,7 @@ def test_a_damaged_config_is_named(tmp_path, text):
 
 
 def test_a_run_notes_each_machine_with_its_first_start_and_its_last_end(tmp_path, monkeypatch):
-    run, here = RunFolder(tmp_path), machine_of(torch.bfloat16)
+    run, here = RunFolder(tmp_path), machine_of("bf16")
     assert here["precision"] == "bfloat16"
     assert here["cpu"]
     assert here["commit"] or here["flowrep"]
