@@ -7,6 +7,7 @@ import argparse
 import time
 from collections import Counter
 
+from flowrep.baselines import BaselinePolicy
 from flowrep.envs import make_env
 from flowrep.experiment.evaluation import evaluate
 from flowrep.experiment.outcomes import OUTCOMES, wilson_interval
@@ -32,7 +33,8 @@ def main() -> None:
                 started = time.perf_counter()
                 env = make_env(scene, speed=speed, num_envs=16)
                 seeds = range(args.seed, args.seed + args.episodes)
-                ended = evaluate(env, baseline, [{"episode_seed": seed} for seed in seeds])
+                episodes = [{"episode_seed": seed} for seed in seeds]
+                ended = evaluate(env, BaselinePolicy(baseline), episodes)
                 counts = Counter(episode.outcome for episode in ended)
                 env.close()
                 cells = [cell(counts[outcome], args.episodes) for outcome in OUTCOMES]

@@ -129,13 +129,14 @@ def make_street(close_later, open_streets):
 @pytest.fixture
 def drive(open_streets):
     """Drives episodes 0, 1, ... with a baseline, and returns them as they end."""
+    from flowrep.baselines import BaselinePolicy
     from flowrep.envs import make_env
     from flowrep.experiment.evaluation import evaluate
 
     def drive(baseline, count, scene="straight_road", **options):
         env = make_env(scene, num_envs=min(count, 20))
         episodes = [{"episode_seed": seed, **options} for seed in range(count)]
-        found = list(evaluate(env, baseline, episodes))
+        found = list(evaluate(env, BaselinePolicy(baseline), episodes))
         env.close()
         return found
 

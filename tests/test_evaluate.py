@@ -13,6 +13,7 @@ pytest.importorskip("pybullet", reason="agents are evaluated in the simulated st
 
 from examples import export_agent, share_agent
 from flowrep.agent import CheckpointError
+from flowrep.baselines import BaselinePolicy
 from flowrep.config.options import validated
 from flowrep.config.usage import UsageError
 from flowrep.envs import WorkerError, workers
@@ -20,7 +21,7 @@ from flowrep.evaluate import candidates_of
 from flowrep.evaluate import run as evaluate
 from flowrep.experiment import build
 from flowrep.experiment.agents import Agent
-from flowrep.experiment.evaluation import BaselinePolicy, PairedEvaluation
+from flowrep.experiment.evaluation import PairedEvaluation
 from flowrep.experiment.policies import PolicyError
 from flowrep.experiment.run import RunFolder
 from flowrep.experiment.runner import Runner
@@ -171,10 +172,9 @@ def some(tmp_path, monkeypatch, driver):
 
 
 def test_the_runs_of_a_sweep_are_evaluated_on_the_same_episodes(some, monkeypatch):
-    drivers = []
+    drivers, enter = [], BaselinePolicy.enter
     monkeypatch.setattr(
-        "flowrep.experiment.evaluation.BaselinePolicy",
-        lambda name, env: drivers.append(name) or BaselinePolicy(name, env),
+        BaselinePolicy, "enter", lambda self, env: drivers.append(self.name) or enter(self, env)
     )
     folders, config = some("good_1", "good_2", overrides=["baselines=[random]"])
     evaluate(config)

@@ -9,6 +9,7 @@ import torch
 
 pytest.importorskip("pybullet", reason="the environments are built with it")
 
+from flowrep.baselines import BaselinePolicy
 from flowrep.config.options import validated
 from flowrep.config.usage import UsageError
 from flowrep.experiment import build
@@ -63,7 +64,7 @@ def test_an_agent_acts_on_a_users_map_and_a_film_shows_it(config):
     assert [codec.key for codec in agent.codecs] == ["ego", "contact"]
     assert "raw" not in maps  # which it reads, and nobody asked for
     env.close()
-    film = Film(Agent("never_turn", config))
+    film = Film(Agent(BaselinePolicy("never_turn"), config))
     assert "contact" in film.framed
     film.close()
 
@@ -71,7 +72,8 @@ def test_an_agent_acts_on_a_users_map_and_a_film_shows_it(config):
 def test_a_film_leaves_out_a_map_that_is_no_picture_of_the_camera_s_shape(config):
     upright = {"_target_": "torchrl.envs.PermuteTransform", "dims": [-3, -1, -2]}
     own = {"ego": {"scale": 1.0}, "upright": {**upright, "in_keys": [("sensor", "depth")]}}
-    film = Film(Agent("never_turn", config.model_copy(update={"representations": own})))
+    config = config.model_copy(update={"representations": own})
+    film = Film(Agent(BaselinePolicy("never_turn"), config))
     assert film.framed == ["ego"]
     film.close()
 

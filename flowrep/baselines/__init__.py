@@ -1,11 +1,12 @@
 """Baselines to compare an agent with: privileged planners, never turning, random actions."""
 
 from collections.abc import Callable
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
-from torchrl.envs import TransformedEnv
+from torchrl.envs import EnvBase
 
 from flowrep.baselines.planner import Planner
 from flowrep.envs import StreetEnv, street_envs
@@ -46,18 +47,18 @@ BASELINES: dict[str, Callable[[], Baseline]] = {
 
 
 class BaselinePolicy:
-    """A baseline as a policy for `evaluate`, which chooses the actions of an env's streets.
+    """A baseline, by its name in `BASELINES`, as a policy for `evaluate`."""
 
-    It needs no observation, and an env without representations renders nothing.
+    ENV: ClassVar[dict[str, Any]] = {"representations": {}, "num_workers": 0, "device": "cpu"}
+    """Arguments of `make_env` for an env that renders nothing: a baseline needs no observation."""
 
-    Args:
-        name: one of `BASELINES`.
-        env: made by `make_env` without workers.
-    """
+    def __init__(self, name: str) -> None:
+        self.name = name
 
-    def __init__(self, name: str, env: TransformedEnv) -> None:
+    def enter(self, env: EnvBase) -> None:
+        """From now on, chooses for the streets of an env that `make_env` made without workers."""
         self._streets = street_envs(env)
-        self._baselines = [BASELINES[name]() for _ in self._streets]
+        self._baselines = [BASELINES[self.name]() for _ in self._streets]
 
     def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes `action` for the streets in `env_id`."""

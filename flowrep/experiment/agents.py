@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from flowrep.agent import save_checkpoint, torch_threads
+from flowrep.baselines import BaselinePolicy
 from flowrep.config.cli import composed
 from flowrep.config.options import validated
 from flowrep.config.usage import UsageError
@@ -136,8 +137,8 @@ class Agent(Driver):
         checked = dict(validated(Episodes, values))
         if checked["policies"] != ["greedy"] and not hasattr(self.policy, "get_dist"):
             raise UsageError("policies: only a trained agent can draw its actions")
-        if isinstance(self.policy, str):
-            checked["policies"] = [self.policy]
+        if isinstance(self.policy, BaselinePolicy):
+            checked["policies"] = [self.policy.name]
         evaluation = PairedEvaluation(**checked)
         evaluation.run(self.make_env, self.policy, EVALUATION_ENVS)
         return evaluation.records(**self.origin("evaluate"))
@@ -147,7 +148,7 @@ class Agent(Driver):
 
         With `small`, each weight takes one byte, see `packed`.
         """
-        if not isinstance(self.config, TrainConfig) or isinstance(self.policy, str):
+        if not isinstance(self.config, TrainConfig):
             raise UsageError("only an agent that flowrep trained has weights to save")
         if Path(path).suffix != ".safetensors":
             raise UsageError(f"save to a file whose name ends in .safetensors, not to '{path}'")

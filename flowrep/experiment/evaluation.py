@@ -37,8 +37,6 @@ The keys are the values of the column `evaluation`; conf/evaluate.yaml has the l
 """
 EVALUATION_ENVS = 192  # side by side: more make a step of each cheaper
 
-_BLIND: dict[str, Any] = {"representations": {}, "noise": None, "num_workers": 0, "device": "cpu"}
-"""Changes to the env for baselines, which read the simulator's state instead of observations."""
 _DRAWS = 1  # separates a policy's draws from other draws that use the episode's seed
 
 
@@ -46,7 +44,7 @@ _DRAWS = 1  # separates a policy's draws from other draws that use the episode's
 class Driver:
     """A policy and the config of the env in which it acts."""
 
-    policy: Policy | str  # writes `action`; or a baseline's name
+    policy: Policy  # writes `action`
     config: EnvConfig
     frames: int = 0  # frames of its training; 0 if unknown
     trained_in: Scene | None = None  # None if unknown
@@ -85,11 +83,11 @@ class _Running:
 @torch.no_grad()
 def evaluate(
     env: EnvBase,
-    policy: Policy | str,
+    policy: Policy,
     episodes: Iterable[Mapping[str, Any]],
     *,
     greedy: bool = True,
-    on_frame: Callable[[TensorDictBase], Any] | None = None,
+    on_frame: Callable[[TensorDictBase], Any] = lambda tensordict: None,
     stop: StopRequest | None = None,
 ) -> Iterator[EpisodeRecord]:
     """Yields the records of episodes, in the order in which they end.
@@ -100,14 +98,14 @@ def evaluate(
 
     Args:
         env: made by `make_env`; without workers for a baseline.
-        policy: writes `action` `[N]`, and has `get_dist` if it isn't greedy; or a baseline's name.
+        policy: writes `action` `[N]`, and has `get_dist` if it isn't greedy.
         episodes: options of `StreetEnv.reset`, `episode_seed` among them.
         greedy: whether the likeliest action is taken, or one is drawn.
-        on_frame: called with the env's TensorDict after each reset and each step.
+        on_frame: called with the TensorDict of each step, and of each end, which has no `action`.
         stop: ends the evaluation between two steps.
     """
-    if isinstance(policy, str):
-        policy = BaselinePolicy(policy, env)
+    if isinstance(policy, BaselinePolicy):
+        policy.enter(env)
     waiting = deque(episodes)
     paths = [path.name for path in env.base_env.scene.paths]
     running: dict[int, _Running] = {}  # by the env's index
@@ -123,20 +121,19 @@ def evaluate(
             vehicles = tensordict["vehicle"].tolist()
             for i, episode in begun.items():
                 episode.positions.append(vehicles[i][:2])
-            if on_frame is not None:
-                on_frame(tensordict)
         assert tensordict is not None
         busy = sorted(running)
         tensordict["action"] = _act(policy, tensordict, busy, running, greedy)
+        on_frame(tensordict)
         tensordict = env.step(tensordict)["next"]
-        if on_frame is not None:
-            on_frame(tensordict)
         status = {
             key: tensordict[key].tolist()
             for key in ("vehicle", "reward", "outcome", "hit", "path", "episode_seed")
         }
         # `tolist` above copies each key once; reading env by env would wait for a GPU each time.
         free = [i for i in busy if status["outcome"][i][0]]
+        if free:
+            on_frame(tensordict)
         for i in busy:
             running[i].positions.append(status["vehicle"][i][:2])
             running[i].return_ += status["reward"][i][0]
@@ -235,7 +232,7 @@ class PairedEvaluation:
     def run(
         self,
         make_env: Callable[..., EnvBase],
-        policy: Policy | str,
+        policy: Policy,
         num_envs: int,
         *,
         stop: StopRequest | None = None,
@@ -266,7 +263,7 @@ class PairedEvaluation:
     def _episodes(
         self,
         make_env: Callable[..., EnvBase],
-        policy: Policy | str,
+        policy: Policy,
         num_envs: int,
         stop: StopRequest | None,
         on_frame: Callable[[TensorDictBase], Any],
@@ -274,8 +271,7 @@ class PairedEvaluation:
         """Yields the missing episodes."""
         # An env has one frame rate; its pedestrians' speed changes from episode to episode.
         for rate in self.fps:
-            own = _BLIND if isinstance(policy, str) else {}  # the policy itself may be a baseline
-            for names, changes in ((self.policies, own), (self.baselines, _BLIND)):
+            for names, changes in ((self.policies, {}), (self.baselines, BaselinePolicy.ENV)):
                 jobs = {name: self._job(name, policy, rate) for name in names}
                 most = max((len(job["episodes"]) for job in jobs.values()), default=0)
                 if stop or not most:
@@ -286,7 +282,7 @@ class PairedEvaluation:
                         for episode in evaluate(env, **job, on_frame=on_frame, stop=stop):
                             yield replace(episode, policy=name)
 
-    def _job(self, name: str, policy: Policy | str, rate: float) -> dict[str, Any]:
+    def _job(self, name: str, policy: Policy, rate: float) -> dict[str, Any]:
         """Returns the arguments of `evaluate` for a policy's missing episodes at a frame rate."""
         missing = [
             {"episode_seed": seed, "speed": speed}
@@ -294,7 +290,7 @@ class PairedEvaluation:
             for seed in self._seeds
             if seed not in self._groups[speed, rate, name]
         ]
-        driver = name if name in self.baselines else policy
+        driver = BaselinePolicy(name) if name in self.baselines else policy
         return {"policy": driver, "episodes": missing, "greedy": name != "sampled"}
 
     def records(self, **origin: Any) -> list[EpisodeRecord]:

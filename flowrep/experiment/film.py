@@ -13,7 +13,6 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Categorical, TensorSpec
 
-from flowrep.baselines import BaselinePolicy
 from flowrep.envs import street_envs
 from flowrep.experiment.evaluation import Driver, evaluate
 from flowrep.experiment.outcomes import EpisodeRecord
@@ -52,7 +51,7 @@ class FilmFrame(NamedTuple):
 
     maps: dict[str, Tensor]  # [C, H, W] by tile; ids, metres or px per step
     steps: int  # of the episode so far
-    action: int | None = None  # chosen at this frame; None if unknown, as in the last frame
+    action: int | None  # chosen at this frame; None in the last one
 
 
 class Film:
@@ -83,8 +82,6 @@ class Film:
             **changes,
         )
         (self.street,) = street_envs(self.env)
-        policy = agent.policy
-        self.policy = BaselinePolicy(policy, self.env) if isinstance(policy, str) else policy
         self.tiles = stock_tiles()
         # Appended behind the agent's transforms, these read the sensors as they are, without noise.
         if exact := [name for name in self.tiles if name not in (*read, "rgb")]:
@@ -136,18 +133,13 @@ class Film:
         """
         frames: list[FilmFrame] = []
 
-        def act(tensordict: TensorDictBase) -> TensorDictBase:
-            # `keep` has appended the frame that the policy sees now.
-            acted = self.policy(tensordict)
-            frames[-1] = frames[-1]._replace(action=int(acted["action"]))
-            return acted
-
         def keep(tensordict: TensorDictBase) -> None:
             maps = {tile: to(tensordict[key][0].cpu()) for tile, (key, to) in self._maps.items()}
-            frames.append(FilmFrame(maps, self.street.episode.steps))
+            action = int(tensordict["action"]) if "action" in tensordict else None
+            frames.append(FilmFrame(maps, self.street.episode.steps, action))
             on_frame(tensordict)
 
-        (episode,) = evaluate(self.env, act, [options], on_frame=keep)
+        (episode,) = evaluate(self.env, self.agent.policy, [options], on_frame=keep)
         return frames, episode
 
     def draw(self, frame: FilmFrame, ended: EpisodeRecord | None = None) -> Image:

@@ -80,9 +80,11 @@ class NamedBaseline(NamedPolicy):
     """A policy that reads the simulator's state and sees no map, such as the planner."""
 
     def load(self, env: Mapping[str, Any], trusted: Collection[str], precision: Any) -> Loaded:
-        """Returns its name, which `evaluation.evaluate` takes for a policy."""
+        """Returns the baseline, in an env that renders nothing."""
+        from flowrep.baselines import BaselinePolicy
+
         config = _env_config(self._given({**env, "precision": precision}))
-        return self.name, config.model_copy(update={"representations": {}}), 0, None
+        return BaselinePolicy(self.name), config.model_copy(update=BaselinePolicy.ENV), 0, None
 
 
 class TrainedPolicy(NamedPolicy):

@@ -29,7 +29,8 @@ def test_with_the_camera_compensated_what_stands_still_has_hardly_any_object_flo
     options = ["preset=laptop", "flow=estimated", f"motion={motion}", "representations=[ego,obj]"]
     options += ["num_envs=2", "num_workers=0", "device=cpu"]
     env = build.env(composed(*options), keep_sensor=True, seed=0)
-    planner, streets = BaselinePolicy("planner", env), torch.arange(2)
+    planner, streets = BaselinePolicy("planner"), torch.arange(2)
+    planner.enter(env)
     frames = env.rollout(24, lambda td: planner(td.set("env_id", streets)))["next"]
     K, sensor = torch.as_tensor(street_envs(env)[0].K).float(), frames["sensor"]
     env.close()

@@ -11,6 +11,7 @@ from torch import nn
 pytest.importorskip("pybullet", reason="policies drive the simulated street")
 
 from flowrep.agent.networks import stochastic_policy
+from flowrep.baselines import BaselinePolicy
 from flowrep.envs import make_env
 from flowrep.experiment.evaluation import PairedEvaluation, evaluate, scene_id
 from flowrep.scenes import load_scene
@@ -118,8 +119,8 @@ def test_an_episode_does_not_depend_on_what_else_is_in_the_batch(scene):
 def test_a_baseline_and_its_agent_twin_live_through_the_same_episodes(scene):
     seeing, blind = make_env(scene, ["depth"], num_envs=2), make_env(scene, num_envs=3)
     agent = outcomes(evaluate(seeing, straight_on, episodes(6)))
-    assert agent == outcomes(evaluate(blind, "never_turn", episodes(6)))
-    random = outcomes(evaluate(blind, "random", episodes(6)))
+    assert agent == outcomes(evaluate(blind, BaselinePolicy("never_turn"), episodes(6)))
+    random = outcomes(evaluate(blind, BaselinePolicy("random"), episodes(6)))
     assert [row[0] for row in random] == [row[0] for row in agent]
     assert random != agent
     seeing.close()
