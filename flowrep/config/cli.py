@@ -206,7 +206,7 @@ def is_a_mistake(error: Exception) -> bool:
 
 
 def _is_out_of_memory(error: Exception) -> bool:
-    # PyTorch raises one of the first two; numpy and numba raise a MemoryError.
+    # PyTorch's error on a CPU has no class of its own; numpy and numba raise a MemoryError.
     is_gpu = type(error).__name__ == "OutOfMemoryError"
     is_cpu = isinstance(error, RuntimeError) and "can't allocate memory" in str(error)
     return isinstance(error, MemoryError) or is_gpu or is_cpu
@@ -226,7 +226,7 @@ def explained(error: Exception) -> str:
             "in a folder and name the folder with --config-dir"
         )
     if isinstance(error, HydraException | OmegaConfBaseException | YAMLError):
-        return " ".join(str(error).split()).partition(" See https://hydra.cc")[0]
+        return " ".join(str(error).split())
     return str(error)
 
 

@@ -130,7 +130,7 @@ class Runner:
                 return self.agent.act(self.observation)
         except RuntimeError as error:
             self.check()  # the loss may have diverged first, and that error says more
-            if "probability tensor" not in str(error):
+            if self.agent.policy.get_dist(self.observation).probs.isfinite().all():
                 raise
             keys = self.agent.policy.in_keys
             maps = [key for key in keys if not self.observation[key].isfinite().all()]
