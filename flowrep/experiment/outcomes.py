@@ -7,11 +7,13 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_type_hints
 
+import numpy as np
+from numpy.typing import NDArray
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -19,9 +21,6 @@ from rich.table import Table
 from flowrep.files import finite_number, read_rows, whole_number
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from flowrep.experiment.schema import TrainConfig
 
 OUTCOMES = ("success", "collision", "out_of_bounds", "timeout")
@@ -29,10 +28,10 @@ OUTCOMES = ("success", "collision", "out_of_bounds", "timeout")
 
 CAUSES = ("out of bounds", "collision: pedestrian", "collision: other", "timeout")
 
-EPISODE_KEY = (
-    "scene", "scene_id", "evaluation", "frames", "policy", "speed", "fps", "episode_seed",
-)  # fmt: skip
-"""The columns that tell a run's episodes apart."""
+Cell = TypeVar("Cell")
+Key = Annotated[Cell, "key"]  # tells a run's episodes apart
+Result = Annotated[Cell, "result"]  # what happened in the episode
+Implied = Annotated[Cell, "implied"]  # follows from the others and the run's config
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,24 +39,24 @@ class EpisodeRecord:
     """One evaluated episode. All fields but the last are the columns of evaluation.csv."""
 
     # The agent; `evaluate` leaves these empty, and `PairedEvaluation.records` fills them in.
-    scene: str = ""
-    scene_id: str = ""  # a hash of all that defines the scene
-    representations: str = ""  # "ego+obj"
-    flow: str = ""  # "exact" or "estimated"
-    seed: int | str = ""  # of the agent's run; "" for a policy without one
-    frames: int = 0  # of the agent's training
-    evaluation: str = ""  # "training", "final" or "evaluate"
-    policy: str = ""  # "greedy", "sampled", or the name of another policy
+    scene: Key[str] = ""
+    scene_id: Key[str] = ""  # a hash of all that defines the scene
+    representations: Implied[str] = ""  # "ego+obj"
+    flow: Implied[str] = ""  # "exact" or "estimated"
+    seed: Implied[int | str] = ""  # of the agent's run; "" for a policy without one
+    frames: Key[int] = 0  # of the agent's training
+    evaluation: Key[str] = ""  # "training", "final" or "evaluate"
+    policy: Key[str] = ""  # "greedy", "sampled", or the name of another policy
     # The conditions.
-    speed: str  # the pedestrians' speed mode; "" for the env's default
-    fps: float
-    episode_seed: int  # determines path and people, see `StreetEnv.reset`
-    path: str  # the name of the scene's path that the episode drew or was given
+    speed: Key[str]  # the pedestrians' speed mode; "" for the env's default
+    fps: Key[float]
+    episode_seed: Key[int]  # determines path and people, see `StreetEnv.reset`
+    path: Result[str]  # the name of the scene's path that the episode drew or was given
     # How it ended.
-    outcome: str  # one of `OUTCOMES`
-    hit: str  # the category that was hit, or ""
-    return_: float  # undiscounted sum of rewards
-    length: int  # the number of steps T
+    outcome: Result[str]  # one of `OUTCOMES`
+    hit: Result[str]  # the category that was hit, or ""
+    return_: Implied[float]  # undiscounted sum of rewards
+    length: Result[int]  # the number of steps T
     # The vehicle's x and y in metres, `[T + 1, 2]`.
     positions: NDArray[np.float32] = field(repr=False, compare=False)
 
@@ -68,11 +67,15 @@ class EpisodeRecord:
         return row | {"return": round(self.return_, 4)}
 
 
-COLUMNS: dict[str, type] = {
-    each.name.rstrip("_"): {"int": int, "float": float}.get(str(each.type), str)
-    for each in fields(EpisodeRecord)[:-1]
-}
-"""The columns of evaluation.csv in their order, and the types of their cells."""
+def columns_for(*uses: str) -> dict[str, type]:
+    """Returns the columns of evaluation.csv for these uses, in order, with the types of cells."""
+    hints = get_type_hints(EpisodeRecord, include_extras=True)
+    annotated = {name.rstrip("_"): get_args(hint) for name, hint in [*hints.items()][:-1]}
+    types = {name: kind for name, (kind, use) in annotated.items() if use in uses}
+    return {name: kind if kind in (int, float) else str for name, kind in types.items()}
+
+
+COLUMNS = columns_for("key", "result", "implied")
 _LATER = ("scene_id", "path")  # columns that older tables lack; they are read as empty
 _OF_TYPE: dict[type, Callable[[str], Any]] = {int: whole_number, float: finite_number}
 # A misspelt outcome would count as a failure.

@@ -23,9 +23,9 @@ from flowrep.config.usage import UsageError
 from flowrep.config.yaml_file import read_yaml
 from flowrep.experiment.outcomes import (
     COLUMNS,
-    EPISODE_KEY,
     OUTCOMES,
     EpisodeRecord,
+    columns_for,
     read_episodes,
 )
 from flowrep.experiment.schema import TrainConfig, validated_run
@@ -247,7 +247,7 @@ class RunFolder:
 
         They go to the end, so that running the same evaluation again results in the same file.
         """
-        key_of = itemgetter(*EPISODE_KEY)
+        key_of = itemgetter(*columns_for("key"))
         # As text, as a table's rows are read, so that both have the same keys.
         new = [{name: str(cell) for name, cell in each.row().items()} for each in records]
         again = {key_of(row) for row in new}

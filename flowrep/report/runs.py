@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrep.config.options import SpeedMode
-from flowrep.experiment.outcomes import COLUMNS
+from flowrep.experiment.outcomes import columns_for
 from flowrep.experiment.provenance import flattened, origin_of
 from flowrep.experiment.run import RunFolder, RunFolderError
 from flowrep.files import TableError
@@ -35,12 +35,7 @@ STACKS = tuple(dict.fromkeys(FLOW_STACKS + COMPLEMENTARY_STACKS))
 DRAWN_BASELINES = ("never_turn", "random", "planner", "speed_blind")
 _REPRESENTATIONS = ("raw", "ego", "obj", "seg", "seg2", "depth", "depth2", "rgb")
 _SHARED_SCENE_KEYS = ("camera", "frame_rate_hz")  # keys whose values are the same in all scenes
-# Columns of evaluation.csv that don't follow from the run's config and the outcome.
-EPISODE_COLUMNS = {
-    name: kind
-    for name, kind in COLUMNS.items()
-    if name not in ("representations", "flow", "seed", "return")
-}
+EPISODE_COLUMNS = columns_for("key", "result")
 
 
 class Condition(NamedTuple):
