@@ -92,7 +92,7 @@ def make_env(
         num_envs: the batch size.
         num_workers: number of processes that step the envs, see `WorkerVectorEnv`; 0 steps them in
             this process. The results are the same.
-        device: device of the TensorDicts, see `usable_device`; streets are simulated on the CPU.
+        device: of the TensorDicts, "auto" for CUDA's if there is one; streets run on the CPU.
         speed: see `StreetEnv`, as for `frame_rate_hz` and `picture_scale`.
         seed: the seed from which the envs draw their episodes; with None, call `set_seed`.
         keep_sensor: whether to keep the ("sensor", ...) keys; rgb and frame are kept only if a
