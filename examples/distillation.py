@@ -150,7 +150,7 @@ def distil(
     optimizer = torch.optim.Adam(student.parameters(), 3e-4, fused=True)
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, frames // NUM_ENVS)
     memory = TensorDictReplayBuffer(storage=LazyTensorStorage(50_000), batch_size=128)
-    memory.append_transform(make_mirror(env, maps))
+    memory.append_transform(make_mirror(scene, maps))
     seen = env.reset()
     with closing(env), trange(frames // NUM_ENVS, desc="student") as bar:
         for _ in bar:

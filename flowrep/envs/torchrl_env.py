@@ -159,19 +159,19 @@ def make_env(
     return env
 
 
-def make_mirror(env: TransformedEnv, representations: str | Iterable[str]) -> Mirror:
+def make_mirror(
+    scene: str | Path | Mapping[str, Any] | Scene, representations: str | Iterable[str]
+) -> Mirror:
     """Returns the transform that replaces half of a replay batch by mirror images.
 
     Args:
-        env: made by `make_env`; its camera determines which columns mirror each other.
+        scene: as for `make_env`; its camera determines which columns mirror each other.
         representations: the key of a map, or several keys, as in `make_env`.
 
-    >>> env = make_env("straight_road", ["ego", "seg2"])
-    >>> make_mirror(env, ["ego", "seg2"]).swapped_actions
+    >>> make_mirror("straight_road", ["ego", "seg2"]).swapped_actions
     tensor([0, 2, 1])
-    >>> env.close()
     """
-    names, K = as_keys(representations), env.base_env.scene.camera.K
+    names, K = as_keys(representations), load_scene(scene).camera.K
     flows = [name for name in names if name in FLOWS]
     swapped = [YAW_SIGN.index(-sign) for sign in YAW_SIGN]
     return Mirror(names, flow_keys=flows, swapped_actions=swapped, intrinsics=K.tolist())

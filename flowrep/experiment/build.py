@@ -63,7 +63,7 @@ def agent(config: TrainConfig, env: EnvBase) -> Algorithm:
     """Returns the config's algorithm, untrained, for the env's specs and on its device."""
     maker, specs, options, run = _task(config, env)
     if getattr(options, "mirror", False):
-        run["mirror_image"] = make_mirror(env, config.representations)
+        run["mirror_image"] = make_mirror(config.scene, config.representations)
     return maker(*specs, options, **run)
 
 

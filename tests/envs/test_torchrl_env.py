@@ -240,9 +240,8 @@ def test_public_names_are_imported_on_first_use():
         _ = envs.make_envs
 
 
-def test_the_mirror_of_an_env_knows_its_flows_actions_and_camera(make):
-    env = make("straight_road")
-    mirror = make_mirror(env, ["ego", "seg2"])
+def test_the_mirror_of_a_scene_knows_its_flows_actions_and_camera():
+    mirror = make_mirror("straight_road", ["ego", "seg2"])
     mirror.images = "all"
     maps = {"ego": torch.randn(2, 84, 84), "seg2": torch.randint(5, (2, 84, 84))}
     image = mirror(TensorDict(maps | {"action": torch.tensor(1)}))
@@ -251,7 +250,7 @@ def test_the_mirror_of_an_env_knows_its_flows_actions_and_camera(make):
     assert torch.equal(image["ego"][..., 1:], turned[..., :-1])
     assert torch.equal(image["seg2"][..., 1:], maps["seg2"].flip(-1)[..., :-1])
     assert image["action"] == 2
-    assert make_mirror(env, "ego").flow_keys == ["ego"]
+    assert make_mirror("straight_road", "ego").flow_keys == ["ego"]
 
 
 def test_begin_step_does_not_change_the_step(make, in_workers):
