@@ -41,7 +41,7 @@ class RepresentationObservation(gym.Wrapper):
 
     Raises:
         ValueError: the observation is not a dict, or a representation needs something that neither
-            the env nor an argument gives.
+            the env nor an argument gives; at a reset, the env's `K` has changed.
 
     >>> env = gym.make("flowrep/StraightRoad-v0", representations=["ego", "obj"])
     >>> observation, info = env.reset(seed=0)
@@ -63,8 +63,9 @@ class RepresentationObservation(gym.Wrapper):
         self.names = tuple(representations)
         self.joined = joined
         inner = env.unwrapped
-        if intrinsics is None and hasattr(inner, "K"):
-            intrinsics = torch.from_numpy(inner.K)
+        self._K = np.array(inner.K) if intrinsics is None and hasattr(inner, "K") else None
+        if self._K is not None:
+            intrinsics = torch.from_numpy(self._K)
         if num_classes is None:
             num_classes = getattr(inner, "num_classes", None)
         is_list = not isinstance(representations, str)  # which the stack refuses by its whole name
@@ -78,6 +79,12 @@ class RepresentationObservation(gym.Wrapper):
     ) -> tuple[Maps, dict[str, Any]]:
         """Begins an episode."""
         observation, info = self.env.reset(seed=seed, options=options)
+        K: Any = getattr(self.unwrapped, "K", None)
+        if self._K is not None and not np.array_equal(K, self._K):
+            raise ValueError(
+                f"the env's K was {self._K.tolist()} and is now {K.tolist()}: let the env observe "
+                "it, and give its key as intrinsics="
+            )
         # These are the methods of a transform that TorchRL's TransformedEnv calls.
         sensed = _sensed(observation)
         self._now = self._stack._reset(sensed, sensed)
@@ -91,7 +98,8 @@ class RepresentationObservation(gym.Wrapper):
 
     def _arrays(self, tensordict: TensorDictBase) -> Maps:
         maps = {name: tensordict[name].numpy() for name in self.names}
-        return _joined(maps.values()) if self.joined else maps
+        # Copies, as the next step reads the stacks, and colours are the env's own array.
+        return _joined(maps.values()) if self.joined else {n: m.copy() for n, m in maps.items()}
 
     def _space(self, sensors: spaces.Space) -> spaces.Space:
         if not isinstance(sensors, spaces.Dict):
@@ -140,7 +148,7 @@ class RepresentationVectorObservation(gym.vector.VectorWrapper):
         begun = (options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool))
         observation, _ = self.env.reset(seed=seed, options=options)
         self._ended = self._ended & ~begun
-        return self._maps(observation["sensor"], begun), _numbers(observation)
+        return self._maps(observation["sensor"], begun, self._now.clone()), _numbers(observation)
 
     def step(
         self, actions: NDArray[Any]
@@ -153,12 +161,18 @@ class RepresentationVectorObservation(gym.vector.VectorWrapper):
             truncated = ended & (observation["outcome"][:, 0] == Outcome.TIMEOUT)
         return maps, rewards, ended & ~truncated, truncated, _numbers(observation)
 
-    def _maps(self, sensors: Mapping[str, NDArray[Any]], begun: NDArray[np.bool_]) -> Maps:
+    def _maps(
+        self,
+        sensors: Mapping[str, NDArray[Any]],
+        begun: NDArray[np.bool_],
+        others: TensorDictBase | None = None,
+    ) -> Maps:
+        """Returns the maps of streets that have begun an episode, and of others after a step."""
         sensed, rows = _sensed(sensors, [self.num_envs]), torch.as_tensor(begun)
         if rows.all():
             self._now = self._one._stack._reset(sensed, sensed)
         else:
-            self._now = self._one._stack._step(self._now, sensed)
+            self._now = self._one._stack._step(self._now, sensed) if others is None else others
             if rows.any():
                 first = sensed[rows]
                 self._now[rows] = self._one._stack._reset(first, first)
@@ -272,7 +286,7 @@ def _onehot(representations: Representations) -> dict[str, Any]:
     if isinstance(representations, Mapping):
         options |= representations
     for name in {"seg", "seg2"} & options.keys():
-        options[name] = {"encoding": "onehot"} | dict(options[name] or {})
+        options[name] = dict(options[name] or {}) | {"encoding": "onehot"}
     return options
 
 

@@ -42,7 +42,8 @@ def test_maps_are_those_of_the_torchrl_env():
 
 
 def test_joined_maps_are_finite_float_channels_in_the_order_of_the_names():
-    env = gymnasium.make(ID, representations=["depth", "seg", "obj"])
+    described = {"depth": {}, "seg": {"encoding": "ids"}, "obj": {}}  # as in a run's config.yaml
+    env = gymnasium.make(ID, representations=described)
     parts = gymnasium.make(ID, representations=["depth", "seg", "obj"], joined=False)
     for each in (env, parts):
         each.reset(options={"episode_seed": 4})
@@ -97,6 +98,8 @@ def test_streets_of_make_vec_are_single_streets_side_by_side(joined):
         count += one[2].any()
     assert count
     assert one[0] in ours.observation_space
+    again = {"seed": [7, None, None], "options": {"reset_mask": np.array([True, False, False])}}
+    assert differing(*(envs.reset(**again)[0] for envs in (ours, theirs))) == []
 
 
 class Wall(gymnasium.Env):
@@ -130,10 +133,19 @@ def test_an_env_of_ones_own_is_wrapped_by_its_camera():
     np.testing.assert_allclose(observation[0], -40 * 0.1 / 2)  # u; fy would give -2.5
     np.testing.assert_array_equal(observation[1], 0)
     np.testing.assert_allclose(observation[2], 0.02)
+    env = RepresentationObservation(Wall(), ["depth2"], joined=False)
+    env.reset()[0]["depth2"][:] = 9.0  # the caller's own, not what the next step reads
+    np.testing.assert_allclose(env.step(0)[0]["depth2"], 0.02)
     near = RepresentationObservation(Wall(), {"near": Depth(range_m=4.0, out_keys="near")})
     np.testing.assert_array_equal(near.reset()[0], np.full((1, 3, 5), 0.5))
     with pytest.raises(KeyError, match=r"needs key .*'instance'"):
         RepresentationObservation(Wall(), ["raw"], intrinsics=K)
+    Wall.K = np.array(K)
+    env = RepresentationObservation(Wall(), ["ego"])
+    env.unwrapped.K = Wall.K * [[2.0, 1.0, 1.0]]
+    with pytest.raises(ValueError, match=r"K was .*intrinsics="):
+        env.reset()
+    del Wall.K
     with pytest.raises(ValueError, match="need intrinsics="):
         RepresentationObservation(Wall(), ["ego"])
     with pytest.raises(ValueError, match=r"list of names.*'ego'"):
