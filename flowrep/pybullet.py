@@ -301,6 +301,9 @@ class BulletFlow(gym.Wrapper):
             once in the constructor, after a reset. If the env keeps its world, it may also be a
             `BulletCamera`.
 
+    Raises:
+        ValueError: the env observes `"sensor"` already; at a reset, the camera has another K.
+
     Attributes:
         camera: the `BulletCamera`.
         K: its K `[3, 3]`; through further wrappers, `env.get_wrapper_attr("K")`.
@@ -343,7 +346,12 @@ class BulletFlow(gym.Wrapper):
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Begins an episode."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self.camera = self._make(self.env.unwrapped)
+        before, self.camera = self.K, self._make(self.env.unwrapped)
+        if not np.array_equal(self.K, before):
+            raise ValueError(
+                f"K was {before.tolist()} and is now {self.K.tolist()}: flow is computed with that "
+                "of the first camera, so give all episodes one size and projection"
+            )
         return self._beside(observation, self.camera.reset()), info
 
     def step(self, action: Any) -> tuple[dict[str, Any], Any, bool, bool, dict[str, Any]]:

@@ -500,6 +500,13 @@ def test_arrays_of_observations_get_a_name_and_a_name_that_is_taken_is_refused()
     assert np.array_equal(lasting.reset()[0]["sensor"]["prev_from_curr"], np.eye(4))
     with pytest.raises(ValueError, match="'sensor'"):
         BulletFlow(env, camera)
+    angles = iter([60, 60, 70])
+    env = BulletFlow(
+        Point(), lambda env: BulletCamera(env.client, 60, 40, fov_deg=next(angles), view=VIEW)
+    )
+    env.reset()
+    with pytest.raises(ValueError, match=r"K was .* one size and projection"):
+        env.reset()
 
 
 # OpenGL, in a process of its own: a driver that fails may take its process with it
