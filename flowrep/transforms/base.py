@@ -361,6 +361,8 @@ class RecurrentTransform(MapTransform):
     @dispatch(source="in_keys", dest="out_keys", auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the outputs that a replay batch lacks, at its root and under `"next"`."""
+        if not torch.compiler.is_compiling():
+            self._check_writers()
         if missing := [key for key in self.out_keys if tensordict.get(key, None) is None]:
             outputs = self._along_trajectory(tensordict, missing[0])
             for key in missing:
@@ -385,6 +387,16 @@ class RecurrentTransform(MapTransform):
                     following.set(key, value)
             tensordict.set("next", following)
         return tensordict
+
+    def _check_writers(self) -> None:
+        """Raises ValueError if what an earlier transform writes would count as stored."""
+        beside = self._beside()
+        before = [x for x in beside[: beside.index(self)] if isinstance(x, MapTransform)]
+        if twice := [key for key in self.out_keys for x in before if key in x.out_keys]:
+            raise ValueError(
+                f"{type(self).__name__} and an earlier transform write {twice[0]!r}, and in a "
+                "batch the first output counts as the second: give each its out_keys"
+            )
 
     def _along_trajectory(
         self, tensordict: TensorDictBase, missing: NestedKey

@@ -83,6 +83,14 @@ def test_two_cameras_that_share_a_pose_s_key_are_refused():
         TransformedEnv(FakeSensorEnv(), Compose(camera(), camera())).rollout(2)
 
 
+def test_two_cameras_that_share_a_motion_s_key_are_refused_in_a_batch():
+    td = FakeSensorEnv().rollout(2)
+    poses = [("sensor", "world_from_cam"), "other"]  # which isn't needed to see it
+    cameras = Compose(*(CameraMotion(in_keys=key, out_keys=MOTION) for key in poses))
+    with pytest.raises(ValueError, match="earlier transform write 'motion'"):
+        cameras(td)
+
+
 class WithRows(FakeSensorEnv):
     """Has a row for the static world before the bodies' poses, or ids whose spec counts nothing."""
 
