@@ -335,6 +335,15 @@ class RecurrentTransform(MapTransform):
             # one, and the transforms that follow have to see what is computed from it.
             done = flags_of_batch(next_tensordict.get("done"), next_tensordict)
             outputs = self._first_where(done, now, outputs)
+        if (steps := tensordict.get("_step", None)) is not None:
+            # TorchRL skips the step of some envs of a batch: these keep what they had, unless a
+            # later transform has dropped it.
+            steps = flags_of_batch(steps, tensordict)
+            kept = (tensordict.get(key, new) for key, new in zip(self.out_keys, outputs))
+            outputs = tuple(
+                torch.where(expand_as_right(steps, new), new, old)
+                for new, old in zip(outputs, kept)
+            )
         for key, value in zip(self.out_keys, outputs):
             next_tensordict.set(key, value)
         return next_tensordict
@@ -430,12 +439,27 @@ class RecurrentTransform(MapTransform):
             return input_spec
         observation_spec = self.transform_observation_spec(self.parent.observation_spec)
         for key in self.carried_keys:
-            input_spec["full_state_spec"][key] = observation_spec[key].clone()
+            state, spec = input_spec["full_state_spec"], observation_spec
+            *groups, name = (key,) if isinstance(key, str) else key
+            for group in groups:  # of several agents, say, with a batch size of its own
+                spec = spec[group]
+                if state.get(group, None) is None:
+                    state[group] = Composite(shape=spec.shape, device=spec.device)
+                state = state[group]
+            state[name] = spec[name].clone()
         return input_spec
 
     def _check_steps(self, transforms: list[Any]) -> None:
         """Raises ValueError, too, if a later transform changes what the next step reads."""
         super()._check_steps(transforms)
+        for transform in transforms:
+            if "_inv_call" in _methods_that_step(transform.__class__):
+                raise ValueError(
+                    f"{type(transform).__name__} steps the env before its last step, so that "
+                    f"{type(self).__name__} would read the last frame instead of the previous "
+                    "observation: put the former into an inner TransformedEnv and the latter into "
+                    "an outer one, with auto_unwrap=False"
+                )
         for transform in transforms[transforms.index(self) + 1 :]:
             if keys := [key for key in self.carried_keys if key in transform.out_keys]:
                 raise ValueError(

@@ -11,8 +11,15 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Composite, Unbounded
-from torchrl.envs import SerialEnv, TransformedEnv
-from torchrl.envs.transforms import Compose, FrameSkipTransform, NoopResetEnv, Transform
+from torchrl.envs import EnvBase, SerialEnv, TransformedEnv, check_env_specs
+from torchrl.envs.transforms import (
+    Compose,
+    ConditionalSkip,
+    FrameSkipTransform,
+    MultiAction,
+    NoopResetEnv,
+    Transform,
+)
 
 from flowrep import transforms as T
 from flowrep.geometry import ego_flow
@@ -201,6 +208,60 @@ def test_poses_give_the_flow_between_two_observations_though_a_frame_lies_betwee
     once = camera_motion(1, 0)
     want = ego_flow(seen["sensor", "depth"], torch.tensor(INTRINSICS), once @ camera_motion(2, 0))
     torch.testing.assert_close(seen["ego"], want.flow, atol=1e-4, rtol=1e-4)
+
+
+def test_several_actions_in_one_step_need_an_env_of_their_own():
+    several = TransformedEnv(FakeSensorEnv(), MultiAction())
+    with pytest.raises(ValueError, match=r"MultiAction.*CameraMotion.*auto_unwrap=False"):
+        TransformedEnv(several, Compose(*by_poses()), auto_unwrap=True).reset()
+    env = TransformedEnv(several, Compose(*by_poses()), auto_unwrap=False)
+    seen = env.step(env.reset().set("action", torch.tensor([0, 0])))["next"]
+    torch.testing.assert_close(seen["motion"], camera_motion(1, 0) @ camera_motion(2, 0))
+
+
+def test_envs_of_a_batch_that_skip_a_step_keep_what_they_had():
+    def rollout(env: EnvBase) -> TensorDict:
+        stack = T.FrameStack(k=3, in_keys=[("sensor", "depth")], out_keys=["depth3"])
+        at_step_1 = ConditionalSkip(lambda td: td["sensor", "depth"][..., 0, 0] == 2.01)
+        env = TransformedEnv(env, Compose(*by_poses(), stack, at_step_1))
+        return env.rollout(3)
+
+    both = rollout(SerialEnv(2, [FakeSensorEnv, lambda: FakeSensorEnv((), 1)]))
+    alone = rollout(FakeSensorEnv())
+    for key in ("motion", "ego", "depth3"):
+        assert same_bits(both["next", key][0], alone["next", key]), key
+    assert both["next", "motion"][0, -1].equal(camera_motion(1, 0))
+
+
+class Agents(EnvBase):
+    """Three agents with a camera each, in a group with its own batch size."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.cameras = FakeSensorEnv((3,))
+        self.observation_spec = Composite(agents=self.cameras.observation_spec.clone())
+        self.action_spec = Composite(
+            agents=Composite(action=self.cameras.action_spec.clone(), shape=[3])
+        )
+        self.reward_spec = Unbounded((1,))
+
+    def _reset(self, tensordict=None, **kwargs):
+        return TensorDict({"agents": self.cameras._reset().select("sensor")})
+
+    def _step(self, tensordict):
+        seen = self.cameras._step(tensordict["agents"])
+        ended = {key: seen[key].any(0) for key in ("done", "terminated")}
+        return TensorDict({"agents": seen.select("sensor"), "reward": torch.ones(1), **ended})
+
+    def _set_seed(self, seed):
+        """Everything is deterministic."""
+
+
+def test_the_state_of_several_agents_keeps_their_batch_size():
+    camera = T.CameraMotion(in_keys=("agents", "sensor", "world_from_cam"), out_keys="motion")
+    env = TransformedEnv(Agents(), camera)
+    assert env.state_spec["agents", "sensor"].shape == (3,)
+    check_env_specs(env, seed=None)
 
 
 def test_a_transform_that_steps_at_a_reset_is_refused_after_camera_motion():
