@@ -60,12 +60,14 @@ def is_sweep(arguments: list[str]) -> bool:
 
 def run_sweep() -> NoReturn:
     """Runs the sweep of `sys.argv`, prints how its runs ended, and ends the process."""
-    if any(text.startswith("resume=") for text in sys.argv[1:]):
+    # Hydra takes ++ and + in front of keys.
+    keys = [text.lstrip("+").partition("=")[0] for text in sys.argv[1:]]
+    if "resume" in keys:
         cli.exit_with(
             "resume= continues one run; to continue a sweep, repeat its command with "
             "hydra.sweep.dir=<its folder>"
         )
-    typed = [text for text in sys.argv[1:] if not text.startswith("hydra.sweep.dir=")]
+    typed = [text for text, key in zip(sys.argv[1:], keys) if key != "hydra.sweep.dir"]
     folders = [cli.value_of(text) for text in sys.argv[1:] if text not in typed]
     new = f"outputs/{datetime.now():%Y-%m-%d/%H-%M-%S}_sweep"
     folder = Path(folders[-1] if folders else new).absolute()

@@ -127,8 +127,22 @@ def test_a_killed_worker_of_a_launcher_is_no_traceback(monkeypatch, tmp_path, ca
     assert "Traceback" not in said
 
 
-def test_a_sweep_of_one_run_to_continue_is_refused(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["flowrep-train", "-m", "resume=outputs/a"])
+@pytest.mark.parametrize("plus", ["", "++"])
+def test_a_sweep_finds_its_failed_runs_in_the_folder_that_was_typed(monkeypatch, tmp_path, plus):
+    def fail(*_):
+        (tmp_path / "a").mkdir()
+        (tmp_path / "a" / sweep.LOG).write_text("--- failed: error: no space\n")
+
+    monkeypatch.setattr(cli, "run_hydra", fail)
+    monkeypatch.setattr(sys, "argv", ["train", "-m", f"{plus}hydra.sweep.dir={tmp_path}"])
+    with pytest.raises(SystemExit) as ended:
+        sweep.run_sweep()
+    assert ended.value.code == 1
+
+
+@pytest.mark.parametrize("plus", ["", "++"])
+def test_a_sweep_of_one_run_to_continue_is_refused(monkeypatch, capsys, plus):
+    monkeypatch.setattr(sys, "argv", ["flowrep-train", "-m", f"{plus}resume=outputs/a"])
     with pytest.raises(SystemExit) as ended:
         sweep.run_sweep()
     assert ended.value.code == 2
