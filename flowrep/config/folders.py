@@ -56,15 +56,16 @@ def sweep_run_name(overrides: Iterable[str]) -> str:
 
     >>> sweep_run_name(["seed=0", "scene=s_turn", "representations=[ego,obj]", "device=cpu"])
     's_turn_ego+obj_s0'
-    >>> sweep_run_name(["preset=laptop", "algorithm.tau=0.01", "seed=1"])
+    >>> sweep_run_name(["preset=laptop", "algorithm.tau=0.01", "seed=5", "seed=1"])
     'laptop_s1_algorithm.tau-0.01'
     """
 
     def plain(text: str) -> str:
-        joined = re.sub(r"[\[\]{}()'\"\s]", "", text.lstrip("+")).replace(",", "+")
+        joined = re.sub(r"[\[\]{}()'\"\s]", "", text).replace(",", "+")
         return re.sub(r"[^A-Za-z0-9.+_-]", "_", joined)
 
-    values = dict(sorted(text.partition("=")[::2] for text in overrides))
+    last = dict(text.lstrip("+").partition("=")[::2] for text in overrides)
+    values = dict(sorted(last.items()))
     for key in OF_THE_MACHINE:
         values.pop(key, None)
     by_value = (
