@@ -239,8 +239,9 @@ def test_without_poses_flow_depth_and_K_are_judged_among_themselves():
         pair = [dataclasses.replace(frame, world_from_cam=None) for frame in (previous, current)]
         assert found.add(*pair, pair[1].raw)
         wrong.add(*pair, pair[1].raw[::-1].copy())
-    assert found.diagnosis().is_right
-    assert any("not tested" in note for note in found.diagnosis().notes)
+    right = found.diagnosis()
+    assert right.is_right
+    assert any("not tested" in note for note in right.notes)
     assert "flow_channels=row_column" in " ".join(wrong.diagnosis().suspects)
 
 
