@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -72,6 +73,7 @@ class RosBag(Recording):
 
         self.path, self.tolerance_s = Path(path), tolerance_s
         self._written: dict[tuple[str, int], int] = {}  # when, by topic and stamp
+        self._sizes: dict[str, tuple[int, int]] = {}  # of the calibration, by the pictures' topic
         with self._naming():
             source = self.path if self.path.is_dir() else regular(self.path, math.inf)
             older = get_typestore(Stores.LATEST)  # for bags that hold no definitions
@@ -190,8 +192,10 @@ class RosBag(Recording):
         source = self._topic("camera_info", named, there)
         _, info = next(self._messages(source))
         is_ros1, size = hasattr(info, "K"), (info.height, info.width)
+        self._sizes[topic] = size
         K, D, P = (info.K, info.D, info.P) if is_ros1 else (info.k, info.d, info.p)
-        is_rectified = "rect" in topic  # ROS's name for pictures without distortion, of P
+        # ROS's name for pictures without distortion, of P, as in image_rect_color.
+        is_rectified = re.search("[/_]rect", topic) is not None
         matrix = calibration.camera_matrix(P if is_rectified else K, size, 0.0, source)
         distortion = [*D] if np.any(D) and not is_rectified else []
         return matrix, (distortion, calibration.lens_of(info.distortion_model))
@@ -258,6 +262,10 @@ class RosBag(Recording):
         with self._naming():
             rgb: Any = _colour(self._image(self._rgb, stamp), self.path)
             depth: Any = _metres(self._image(self._depth, depth_stamp), self.path)
+        for topic, size in ((self._rgb, rgb.shape[:2]), (self._depth, depth.shape)):
+            if (of_K := self._sizes.get(topic, size)) not in (size, (0, 0)):
+                says = f"has {list(size)} rows and columns, its camera_info says {list(of_K)}"
+                raise SequenceError(self.path, f"{topic} {says}: give format.camera_info=")
         rgb, depth = self._rig(rgb, depth, self.K, self._K_depth)
         options: Any = {"timestamp_s": stamp * 1e-9, "position": position}
         return Frame(_name(stamp), self.path, pose, self.K, depth, rgb, **options)

@@ -73,14 +73,14 @@ class Bag:
         fields |= {"header": self.header(ns, frame)}
         self.write(topic, "sensor_msgs/CompressedImage", ns + 5, **fields)
 
-    def info(self, topic, frame, lens=()):
+    def info(self, topic, frame, lens=(), width=WIDTH):
         roi = self.make("sensor_msgs/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0,
                         do_rectify=False)  # fmt: skip
         names = dict(zip("dkrp", "DKRP")) if self.is_ros1 else dict(zip("dkrp", "dkrp"))
         numbers = {"d": np.array(lens), "k": OPENCV_K.ravel(), "r": np.eye(3).ravel()}
         numbers |= {"p": np.hstack([OPENCV_K, np.zeros((3, 1))]).ravel()}
         fields = {names[name]: np.array(value, float) for name, value in numbers.items()}
-        fields |= {"height": HEIGHT, "width": WIDTH, "distortion_model": "plumb_bob", "roi": roi}
+        fields |= {"height": HEIGHT, "width": width, "distortion_model": "plumb_bob", "roi": roi}
         fields |= {"binning_x": 0, "binning_y": 0, "header": self.header(START_NS, frame)}
         self.write(topic, "sensor_msgs/CameraInfo", START_NS, **fields)
 
@@ -228,6 +228,29 @@ def test_depth_of_another_camera_is_registered_or_refused(tmp_path):
         bag.image("/depth/image", START_NS, "depth_optical", "32FC1", wall)
     depth = open_recording(bag.path, "rosbag")[0].depth
     assert np.isnan(depth[5]).nonzero()[0].tolist() == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("topic", "is_bent"), [("/direct/image_raw", True), ("/color/image_rect_color", False)]
+)
+def test_only_pictures_that_are_called_rectified_keep_their_pixels(topic, is_bent, tmp_path):
+    rgb, bag = make_moments(unit_m=0.001)[0].rgb, Bag("ros1", tmp_path)
+    with bag.writer:
+        bag.info(f"{topic.rsplit('/', 1)[0]}/camera_info", "optical", [0.2, 0.0, 0.0, 0.0, 0.0])
+        bag.image(topic, START_NS, "optical", "rgb8", rgb)
+        bag.image("/depth", START_NS, "optical", "32FC1", np.ones((HEIGHT, WIDTH), np.float32))
+    assert np.array_equal(open_recording(bag.path, "rosbag")[0].rgb, rgb) != is_bent
+
+
+def test_a_calibration_of_larger_pictures_is_refused(tmp_path):
+    bag = Bag("ros1", tmp_path)
+    with bag.writer:
+        bag.info("/color/camera_info", "optical", width=2 * WIDTH)
+        grey, depth = np.zeros((HEIGHT, WIDTH), np.uint8), np.ones((HEIGHT, WIDTH), np.float32)
+        bag.image("/color/image", START_NS, "optical", "mono8", grey)
+        bag.image("/depth/image", START_NS, "optical", "32FC1", depth)
+    with pytest.raises(SequenceError, match=r"/color/image has .*camera_info"):
+        open_recording(bag.path, "rosbag")[0]
 
 
 def test_topics_that_could_be_either_are_named(tmp_path):
