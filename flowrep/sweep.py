@@ -20,6 +20,7 @@ import sys
 import time
 from collections.abc import Callable
 from datetime import datetime
+from itertools import product
 from pathlib import Path
 from typing import IO, Any, NoReturn
 
@@ -27,7 +28,12 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from flowrep.config import cli
-from flowrep.config.folders import OF_THE_MACHINE, register_resolvers, settings_of
+from flowrep.config.folders import (
+    OF_THE_MACHINE,
+    register_resolvers,
+    settings_of,
+    sweep_run_name,
+)
 from flowrep.config.foreign import checked_files
 from flowrep.config.usage import UsageError
 from flowrep.config.yaml_file import read_yaml
@@ -88,8 +94,8 @@ def run_sweep() -> NoReturn:
             cli.run_hydra("train", job, TrainConfig)
         except SystemExit as end:  # its reason has been printed
             code = end.code
-    logs = sorted(filter(Path.is_file, folder.glob(f"*/{LOG}")))
-    states = {log.parent.name: state_of(log) for log in logs}
+    logs = sorted(filter(Path.is_file, folder.rglob(LOG)))  # hydra.sweep.subdir= may have folders
+    states = {str(log.parent.relative_to(folder)): state_of(log) for log in logs}
     if not states:  # a mistake on the command line
         sys.exit(stop.exit_code or code)
     finished = sum(state.startswith(FINISHED) for state in states.values())
@@ -196,6 +202,25 @@ def _end_with_parent() -> None:
     signal.signal(signal.SIGUSR2, signal.SIG_IGN)  # SLURM sends it for its launcher
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
+
+
+def check_folders_differ(hydra: DictConfig) -> None:
+    """Checks that no two runs of a sweep have the same folder, where only one would be run."""
+    values: dict[str, list[str]] = {}
+    listed = [f"{key}={value}" for key, value in (hydra.sweeper.params or {}).items()]
+    for text in [*listed, *hydra.overrides.task]:
+        given = cli.parsed(text)
+        if given is not None and (given.is_choice_sweep() or given.is_range_sweep()):
+            key = given.get_key_element()
+            values[key] = [f"{key}={value}" for value in given.sweep_string_iterator()]
+        else:
+            values[text.partition("=")[0]] = [text]
+    names = [sweep_run_name(each) for each in product(*values.values())]
+    if twice := [name for i, name in enumerate(names) if name in names[:i]]:
+        raise UsageError(
+            f"the sweep has two runs for its folder {twice[0]}: leave out values that are given "
+            f"twice, and compare values of {', '.join(OF_THE_MACHINE)} in a sweep each"
+        )
 
 
 def _check_is_same(folder: Path, config: TrainConfig) -> None:

@@ -49,6 +49,13 @@ class EarlyCheck(Callback):
         except Exception as error:  # Hydra would print a warning and go on
             end_with(error)
 
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Ends the process if two runs of a sweep would share a folder."""
+        try:
+            sweep.check_folders_differ(config.hydra)
+        except Exception as error:
+            end_with(error)
+
 
 def run(config: TrainConfig) -> None:
     """Trains, evaluates and films one agent, or continues a run with `resume=`."""

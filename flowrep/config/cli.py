@@ -28,6 +28,7 @@ from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.core.utils import env_override
 from hydra.errors import HydraException, MissingConfigException
 from hydra.initialize import get_gh_backup, restore_gh_from_backup
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
@@ -148,6 +149,16 @@ def checked(config: DictConfig, schema: type[Model]) -> Model:
     model: Any = validated(schema, plain)
     _check_no_file_is_hidden(job)
     typed = job.overrides.task
+    for given in filter(None, map(parsed, typed)):
+        names: Any = given.value() if given.key_or_group in config_groups() else None
+        for i, name in enumerate(names if isinstance(names, list) else ()):
+            if name in names[:i]:  # Hydra would read its file once
+                raise UsageError(f"{given.input_line}: {name} is given twice; leave one out")
+    if job.sweeper.params and job.mode != RunMode.MULTIRUN:
+        raise UsageError(
+            f"{', '.join(job.sweeper.params)}: the experiment lists runs, which need -m; without "
+            "it, a single run would leave the list out"
+        )
     # The schema keeps unknown keys for who adds one by `+note=pilot`, not for a file's typo.
     keys = [text.partition("=")[0].rpartition("@")[2] for text in typed]  # +group@key=choice
     for key in (model.model_extra or {}).keys() - {key.lstrip("+").split(".")[0] for key in keys}:
@@ -276,11 +287,11 @@ def _is_folder(key: str, value: str) -> bool:
 
 def value_of(text: str) -> str:
     """Returns the value of an override as text, without Hydra's quotes."""
-    parsed = _parsed(text)
-    return text.partition("=")[2] if parsed is None else str(parsed.value())
+    read = parsed(text)
+    return text.partition("=")[2] if read is None else str(read.value())
 
 
-def _parsed(text: str) -> Any:
+def parsed(text: str) -> Any:
     """Returns an override as Hydra reads it, None if it can't."""
     try:
         return OverridesParser.create().parse_overrides([text])[0]
@@ -290,8 +301,8 @@ def _parsed(text: str) -> Any:
 
 def override(key: str, text: str) -> str:
     """Returns an override that sets `key` to exactly `text`, quoted only if necessary."""
-    parsed = None if "${" in text else _parsed(f"{key}={text}")
-    if parsed is not None and parsed.value() == text:
+    read = None if "${" in text else parsed(f"{key}={text}")
+    if read is not None and read.value() == text:
         return f"{key}={text}"
     # OmegaConf would replace an interpolation, and takes backslashes before one as escapes.
     text = re.sub(r"(\\*)\$\{", lambda match: match[1] * 2 + r"\${", text)

@@ -43,6 +43,11 @@ MISTAKES = [
     ("train outputs", ["outputs"]),
     ("train seed=0,1", ["seed=0,1"]),
     ("report x run=y", ["x", "run="]),
+    # what would be done in part, without a word
+    ("train representations=[ego,obj,ego]", ["representations=[ego,obj,ego]", "twice"]),
+    ("train experiment=recipe", ["seed, representations", "-m"]),
+    ("train -m seed=3,4,3", ["s3", "twice"]),
+    ("train -m seed=3 threads=1,2", ["s3", "threads"]),
     # places that don't exist, flags that contradict each other
     ("train --config-dir nowhere", ["nowhere"]),
     ("train --config-name nope", ["nope"]),

@@ -56,5 +56,6 @@ def test_a_file_that_leaves_its_group_is_refused_before_anything_runs(run, tmp_p
 def test_a_file_may_set_what_its_group_is_for(run, tmp_path, group, text, key):
     written(tmp_path, group, text)
     choice = "=".join(f"{group}/mine".split("/", 1))  # scene=city/mine
-    _, found, said = run("train", "--config-dir", str(tmp_path), choice)
+    flags = ["-m"] if group == "experiment" else []
+    _, found, said = run("train", *flags, "--config-dir", str(tmp_path), choice)
     assert key in said.err if key else found[0].seed == 7

@@ -127,11 +127,13 @@ def test_a_killed_worker_of_a_launcher_is_no_traceback(monkeypatch, tmp_path, ca
     assert "Traceback" not in said
 
 
-@pytest.mark.parametrize("plus", ["", "++"])
-def test_a_sweep_finds_its_failed_runs_in_the_folder_that_was_typed(monkeypatch, tmp_path, plus):
+@pytest.mark.parametrize(("plus", "run"), [("", "a"), ("++", "a"), ("", "a/b")])
+def test_a_sweep_finds_its_failed_runs_in_the_folder_that_was_typed(
+    monkeypatch, tmp_path, plus, run
+):
     def fail(*_):
-        (tmp_path / "a").mkdir()
-        (tmp_path / "a" / sweep.LOG).write_text("--- failed: error: no space\n")
+        (tmp_path / run).mkdir(parents=True)
+        (tmp_path / run / sweep.LOG).write_text("--- failed: error: no space\n")
 
     monkeypatch.setattr(cli, "run_hydra", fail)
     monkeypatch.setattr(sys, "argv", ["train", "-m", f"{plus}hydra.sweep.dir={tmp_path}"])
