@@ -41,10 +41,9 @@ class Camera(pydantic.BaseModel):
     distortion: list[float] = []
     lens: Lens = "opencv"
 
-    @property
-    def numbers(self) -> list[float]:
-        """fx, fy, cx, cy, with the centre of pixel (0, 0) at (0.5, 0.5)."""
-        shift = 0.5 - self.first_pixel_centre
+    def numbers(self, first_pixel_centre: float) -> list[float]:
+        """Returns fx, fy, cx, cy, with the centre of pixel (0, 0) at this place in x and y."""
+        shift = first_pixel_centre - self.first_pixel_centre
         return [self.fx, self.fy, self.cx + shift, self.cy + shift]
 
 
@@ -111,7 +110,8 @@ def _renamed(given: dict[str, Any]) -> dict[str, Any]:
 
     camera = {"width": of("width", "image_width", "w"), "height": of("height", "image_height", "h")}
     matrix = of("camera_matrix", "cameraMatrix", "intrinsic_matrix", "K", "k")
-    lens = lens_of(of("distortion_model", "camera_model"))
+    is_fisheye = given.get("is_fisheye") is True  # instant-ngp's, which names no model
+    lens = lens_of("fisheye" if is_fisheye else of("distortion_model", "camera_model"))
     if matrix is not None:
         K = camera_matrix(matrix, (1, 1), 0.5)
         camera["first_pixel_centre"] = 0.0
@@ -119,11 +119,13 @@ def _renamed(given: dict[str, Any]) -> dict[str, Any]:
         names = "distortion_coefficients", "distortionCoefficients", "dist_coeffs", "D", "d"
         coefficients = of(*names) or []
     elif {"fl_x", "camera_angle_x"} & {*given}:
+        angle_y = given.get("camera_angle_y")
         camera["first_pixel_centre"] = 0.5
         width, height = (size or math.nan for size in (camera["width"], camera["height"]))
         fx = of("fl_x", "fx") or width / 2 / math.tan(given["camera_angle_x"] / 2)
         centre = given.get("cx", width / 2), given.get("cy", height / 2)
-        numbers = [fx, of("fl_y", "fy") or fx, *centre]
+        fy = of("fl_y", "fy") or (height / 2 / math.tan(angle_y / 2) if angle_y else fx)
+        numbers = [fx, fy, *centre]
         order = ["k1", "k2", "k3", "k4"]
         if lens == "opencv":
             order = ["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"][: 8 if "k4" in given else 5]

@@ -105,6 +105,9 @@ class DeclaredRecording(Recording):
         left_out["in format.leave_out"] = np.isin(self._names, list(self.leave_out))
         self._choose(left_out)
         unit_m = self.depth_unit_m or files.stored_depth(self._depths[0], self.depth_coding)[1]
+        if self.depth_unit_m is None and unit_m != 1 and self.depth_kind not in ("z", "ray_length"):
+            says = f"needs a value: whole numbers of kind {self.depth_kind} have no usual unit"
+            raise SequenceError("format.depth_unit_m", says)
         named = ["pose_layout", "pose_direction", "pose_axes", "depth_kind"]
         named += ["flow_direction", "flow_channels"]
         self.conventions = {name: getattr(self, name) for name in named}
@@ -257,7 +260,8 @@ class DeclaredRecording(Recording):
             if count != len(rows):
                 raise SequenceError(path, f"has {count} rows for {len(rows)} frames")
         elif by == "time" and self._times_s is not None:
-            times_s = _ascending(path, keys * self.time_unit_s) + self.pose_offset_s
+            stamps = np.asarray(keys, np.float64)  # which a JSON may hold as text
+            times_s = _ascending(path, stamps * self.time_unit_s) + self.pose_offset_s
             options: Any = {"interpolate": self.interpolate}
             return match_times(times_s, self._times_s, self.tolerance_s, **options)
         else:
@@ -317,7 +321,7 @@ class DeclaredRecording(Recording):
         if isinstance(given, str) and given.endswith(calibration.FILES):
             camera = calibration.read_camera(self._path(given))
             self._size = camera.height, camera.width  # of the camera of K
-            given, self.first_pixel_centre = camera.numbers, 0.5
+            given = camera.numbers(self.first_pixel_centre)
             if not self.distortion:
                 self.distortion, self.lens = camera.distortion, camera.lens
         lacking = np.zeros(len(self._names), dtype=bool)
@@ -351,6 +355,9 @@ class DeclaredRecording(Recording):
         kept, notes = matching.keep(self._names, left_out, self.folder, remedy)
         if self.distortion:
             notes.append("pictures and depth are undistorted")
+        if self._video and self.rows_by != "number" and self._video.count > len(self._names):
+            says = f"has {self._video.count} pictures for {len(self._names)} depth maps"
+            notes.append(f"{self._video.path.name} {says}: the first ones are taken, in order")
         self._order = kept[:: -1 if self.backwards else 1]
         self.count, self.notes = len(kept), tuple(notes)
         # Recorded flow does not skip a frame, so that each gap begins a clip.
@@ -379,7 +386,10 @@ class DeclaredRecording(Recording):
             rgb = cv2.resize(rgb, depth.shape[::-1], interpolation=cv2.INTER_AREA)
         if self._depth_numbers is not None:
             K_depth = camera_matrix(self._depth_numbers, depth.shape, self.first_pixel_centre)
-        rgb, depth = self._rig(rgb, self._along_axis(depth, K_depth), K, K_depth)
+            depth = self._along_axis(depth, K_depth)
+        rgb, depth = self._rig(rgb, depth, K, K_depth)
+        if self._depth_numbers is None:  # once the lens is taken out, pixels see along K's rays
+            depth = self._along_axis(depth, K)
         pose = self._poses[i] if self.has_poses else None
         time_s = None if self._times_s is None else float(self._times_s[i])
         position: Any = {"clip": int(self._clips[i]), "position": int(self._positions[i])}
@@ -449,7 +459,7 @@ class DeclaredRecording(Recording):
 
 
 def _number(name: str) -> int:
-    digits = re.search(r"[0-9]+$", name)
+    digits = re.search(r"[0-9]+(?=\D*$)", name)  # the last ones, as in 0001_left
     return int(digits[0]) if digits else -1
 
 

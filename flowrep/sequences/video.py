@@ -70,6 +70,9 @@ class VideoPictures:
 
     def __init__(self, path: Path) -> None:
         self.path = regular(path, math.inf)
+        capture: Any = cv2.VideoCapture(str(self.path))
+        self.count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))  # as the file says, 0 if it doesn't
+        capture.release()
         self._next, self._pictures = 0, iter(list[NDArray[np.uint8]]())
 
     def __getitem__(self, index: int) -> NDArray[np.uint8]:

@@ -148,8 +148,12 @@ def test_poses_by_the_times_of_a_table_or_by_names_that_come_first(by, moments, 
     put(tmp_path / "poses.txt", poses[::-1] if by == "name" else poses)
     times = None if by == "name" else "timestamps.txt"
     recording = open_frames(tmp_path, rows_by=by, times=times)
-    for frame, moment in zip(recording, moments, strict=True):
-        np.testing.assert_allclose(frame.world_from_cam, moment.world_from_cam)
+    rows = [{"key": str(k), "pose": m.world_from_cam.tolist()} for k, m in zip(keys, moments)]
+    put(tmp_path / "p.json", [json.dumps({"rows": rows})])  # with times as text
+    options = {"poses": "p.json:rows.*.pose", "key": "p.json:rows.*.key"}
+    for each in (recording, open_frames(tmp_path, rows_by=by, times=times, **options)):
+        for frame, moment in zip(each, moments, strict=True):
+            np.testing.assert_allclose(frame.world_from_cam, moment.world_from_cam)
 
 
 def test_frames_may_be_left_out_by_name(moments, tmp_path):
@@ -227,6 +231,11 @@ def test_rays_are_those_of_depths_camera(moments, tmp_path):
     depth = open_frames(tmp_path, **cameras, depth_kind="ray_length")[0].depth
     assert depth[12, 20] == pytest.approx(2.0)
     assert depth[12, 30] == pytest.approx(2.0 / np.hypot(1, 1 / 3), rel=1e-6)
+    # Beside a file, which says it for its own numbers, the option is that of depth's camera.
+    put(tmp_path / "intrinsics.json", synthetic.camera_json(fx=30.0, fy=30.0, cx=20.5, cy=12.5))
+    opencv = {"depth_intrinsics": [15.0, 15.0, 20.0, 12.0], "first_pixel_centre": 0.0}
+    same = open_frames(tmp_path, **opencv, depth_kind="ray_length")[0].depth
+    np.testing.assert_array_equal(same, depth)
 
 
 def test_a_disparity_of_0_is_no_surface_unless_it_means_missing(moments, tmp_path):
@@ -236,7 +245,9 @@ def test_a_disparity_of_0_is_no_surface_unless_it_means_missing(moments, tmp_pat
     assert depth[0, :2].tolist() == [np.inf, 64.0]  # fx = 31 px: 31 * 0.25 / (31 / 256)
     assert np.isnan(open_frames(tmp_path, **options)[1].depth[0, 0])
     with pytest.raises(ValueError, match="baseline_m"):
-        open_frames(tmp_path, depth_kind="disparity")[1]
+        open_frames(tmp_path, depth_kind="disparity", depth_unit_m=1.0)[1]
+    with pytest.raises(SequenceError, match="depth_unit_m"):  # pixels aren't thousandths
+        open_frames(tmp_path, depth_kind="disparity", baseline_m=0.25)
 
 
 def test_depth_of_little_confidence_is_missing(moments, tmp_path):
@@ -292,6 +303,18 @@ def test_a_lens_is_taken_out_of_pictures_and_depth(lens, place, tmp_path):
     outside = (u < -1) | (u > 120) | (v < -1) | (v > 90)
     assert outside.any() == (lens == "opencv")
     assert np.isnan(frame.depth[outside]).all()
+
+
+def test_a_ray_s_length_is_that_of_the_pixel_without_the_lens(tmp_path):
+    row, column = np.indices((90, 120), dtype=np.float64)
+    opencv, pixels = np.array([[95, 0, 62], [0, 90, 43.5], [0, 0, 1]]), np.stack([column, row], -1)
+    rays = cv2.undistortPoints(pixels.reshape(-1, 1, 2), opencv, np.array(RADIAL))
+    wall = 2.0 * np.sqrt(1 + np.square(rays).sum(-1)).reshape(90, 120)  # 2 m ahead
+    put(tmp_path / "depth/0.npy", wall.astype(np.float32))
+    options = {"rgb": None, "intrinsics": [95.0, 90.0, 62.5, 44.0], "depth_kind": "ray_length"}
+    depth = open_frames(tmp_path, **options, distortion=RADIAL)[0].depth
+    # Of the nearest pixel; by K's rays, the bent corners would be 3 cm off.
+    assert np.nanmax(np.abs(depth - 2)) < 0.012
 
 
 def test_a_lens_needs_as_many_numbers_as_its_formula_has(moments, tmp_path):
@@ -449,8 +472,9 @@ def test_times_do_not_hide_that_a_frame_is_missing(tmp_path):
 def test_a_frame_knows_its_place_in_a_recording_with_gaps(timed, tmp_path):
     places = [0, 1, 2, 4, 5, 8]
     for place in places:
-        put(tmp_path / f"rgb/{10 * place:04d}.png", np.zeros((4, 6, 3), np.uint8))
-        put(tmp_path / f"depth/{10 * place:04d}.png", np.full((4, 6), 1000, np.uint16))
+        name = f"{10 * place:04d}_left.png"
+        put(tmp_path / f"rgb/{name}", np.zeros((4, 6, 3), np.uint8))
+        put(tmp_path / f"depth/{name}", np.full((4, 6), 1000, np.uint16))
     if timed:  # 30 a second, with a jitter of 3 ms
         put(tmp_path / "timestamps.txt", [f"{p / 30 + 0.003 * (p % 2)}" for p in places])
     recording = open_frames(tmp_path, intrinsics=[1.0])

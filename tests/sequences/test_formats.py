@@ -112,6 +112,10 @@ def test_a_video_s_picture_is_that_of_the_frame_s_number(tmp_path):
     recording = open_recording(tmp_path / "in", "stray_scanner")
     assert [frame.name for frame in recording] == ["000000", "000002"]
     np.testing.assert_array_equal(recording[1].rgb, whole[2])
+    # Without numbers nothing says whose pictures they are, and the second would be frame 2's.
+    plain = {"rgb": "rgb.mp4", "intrinsics": [0.5], "resize_rgb": True}
+    (note,) = open_recording(tmp_path / "in", "frames", **plain).notes
+    assert "rgb.mp4 has 3 pictures for 2" in note
 
 
 def test_an_older_stray_recording_has_one_camera(tmp_path):

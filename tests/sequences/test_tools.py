@@ -177,6 +177,10 @@ OPENCV = "%YAML:1.0\n---" + ROS.replace("_matrix:", f"_matrix:{TAG}").replace("s
 COLMAP = f"1 OPENCV {WIDTH} {HEIGHT} 31 27 18.5 13 {numbers(LENS[:4])}"
 NERF = {"fl_x": 31, "fl_y": 27, "cx": 18.5, "cy": 13, "w": WIDTH, "h": HEIGHT}
 NERF_FISHEYE = {"camera_model": "OPENCV_FISHEYE", **dict(zip(("k1", "k2", "k3", "k4"), LENS))}
+NGP_FISHEYE = {"is_fisheye": True, **dict(zip(("k1", "k2", "k3", "k4"), LENS))}
+# Half of 40 x 24 pixels over 31 and 27; without the second angle, fy would be 31.
+ANGLES = dict(zip(("camera_angle_x", "camera_angle_y"), 2 * np.arctan([20 / 31, 12 / 27])))
+ANGLES |= {name: NERF[name] for name in ("cx", "cy", "w", "h")}
 BROWN, FISHEYE = {"distortion": LENS}, {"distortion": LENS[:4], "lens": "fisheye"}
 
 
@@ -190,6 +194,8 @@ BROWN, FISHEYE = {"distortion": LENS}, {"distortion": LENS[:4], "lens": "fisheye
         ("cameras.txt", COLMAP.replace("OPENCV", "OPENCV_FISHEYE"), FISHEYE),
         ("t.json", json.dumps(NERF | dict(zip(("k1", "k2", "p1", "p2"), LENS))), BROWN),
         ("t.json", json.dumps(NERF | NERF_FISHEYE), FISHEYE),
+        ("t.json", json.dumps(NERF | NGP_FISHEYE), FISHEYE),
+        ("t.json", json.dumps(ANGLES), {}),
     ],
 )
 def test_a_calibration_of_another_tool_is_that_camera_and_lens(file, text, lens, tmp_path):
