@@ -26,7 +26,8 @@ def require(what: str, extra: str, *packages: str, module: str = "") -> None:
         if not is_installed(package):
             message = f"{what} needs {package}; {_remedy(package, extra)}"
             if module == "__main__" or Path(sys.argv[0]).name.startswith("flowrep-"):
-                sys.exit(f"error: {message}")
+                print(f"error: {message}", file=sys.stderr)
+                sys.exit(2)
             raise ModuleNotFoundError(message, name=package)
 
 

@@ -20,7 +20,7 @@ require(
 
 from pydantic import ConfigDict, Field, model_validator
 
-from flowrep.config.cli import run_command
+from flowrep.config.cli import EXIT_USAGE, run_command
 from flowrep.config.options import (
     Command,
     Count,
@@ -124,7 +124,7 @@ def factorize_recording(config: FactorizeConfig) -> int:
             # It may be mistaken (docs/diagnosis.md has rates), so it stops nothing unasked.
             if diagnosis.verdict == "wrong" and config.check == "error":
                 print("nothing is written; check=warn factorises all the same", file=sys.stderr)
-                return 2
+                return EXIT_USAGE
         if stopped_by := job.run():
             print(f"stopped after {len(output.rows)} frames, which are in {output.partial}")
             return stopped_by

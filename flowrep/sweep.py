@@ -25,16 +25,16 @@ from pathlib import Path
 from typing import IO, Any, NoReturn
 
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from flowrep.config import cli
+from flowrep.config.config_dir import checked_files
 from flowrep.config.folders import (
     OF_THE_MACHINE,
     register_resolvers,
     settings_of,
     sweep_run_name,
 )
-from flowrep.config.foreign import checked_files
 from flowrep.config.usage import UsageError
 from flowrep.config.yaml_file import read_yaml
 from flowrep.experiment.outcomes import is_finished, success_of
@@ -206,6 +206,9 @@ def _end_with_parent() -> None:
 
 def check_folders_differ(hydra: DictConfig) -> None:
     """Checks that no two runs of a sweep have the same folder, where only one would be run."""
+    typed: Any = OmegaConf.to_container(hydra.sweep, resolve=False)
+    if "sweep_run_name" not in typed["subdir"]:  # named by the user, perhaps by ${hydra.job.num}
+        return
     values: dict[str, list[str]] = {}
     listed = [f"{key}={value}" for key, value in (hydra.sweeper.params or {}).items()]
     for text in [*listed, *hydra.overrides.task]:

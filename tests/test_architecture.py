@@ -40,7 +40,7 @@ THIRD_PARTY_ONLY_IN = {
         "view.py",
         "factorize.py",
         "config/cli.py",
-        "config/foreign.py",
+        "config/config_dir.py",
         "sweep.py",
     },
 }

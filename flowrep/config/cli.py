@@ -36,8 +36,8 @@ from yaml import YAMLError
 from flowrep import __version__
 from flowrep.config import CONF_DIR, config_groups, group_choices
 from flowrep.config.algorithms import ALGORITHMS
+from flowrep.config.config_dir import checked_files
 from flowrep.config.folders import register_resolvers
-from flowrep.config.foreign import checked_files
 from flowrep.config.options import Command, Model, validated
 from flowrep.config.usage import UsageError, closest_first
 

@@ -1,4 +1,4 @@
-"""How a user's mistake is reported: as an error of one line, with the known choices."""
+"""The error of a user's mistake, and its list of choices; `config.cli` prints it as one line."""
 
 from collections.abc import Iterable
 from difflib import get_close_matches

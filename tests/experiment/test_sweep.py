@@ -9,6 +9,7 @@ from concurrent.futures.process import BrokenProcessPool
 
 import pytest
 import yaml
+from omegaconf import OmegaConf
 
 from flowrep import sweep
 from flowrep.config import cli, group_choices
@@ -23,6 +24,14 @@ from tests.running import ENVIRONMENT, run_here
 def test_several_runs_are_asked_for_in_hydras_ways():
     lines = ("-m seed=0,1", "hydra.mode=MULTIRUN seed=0,1", "seed=0")
     assert [sweep.is_sweep(line.split()) for line in lines] == [True, True, False]
+
+
+def test_runs_that_a_user_s_own_folders_keep_apart_may_differ_by_threads_alone():
+    names, own = "${sweep_run_name:${hydra.overrides.task}}", "${hydra.job.num}"
+    runs = {"sweeper": {"params": {}}, "overrides": {"task": ["seed=3", "threads=1,2"]}}
+    sweep.check_folders_differ(OmegaConf.create(runs | {"sweep": {"subdir": own}}))
+    with pytest.raises(UsageError, match=r"s3.*threads"):
+        sweep.check_folders_differ(OmegaConf.create(runs | {"sweep": {"subdir": names}}))
 
 
 # What is done of one run, whose final evaluation is one episode of each of four policies.
