@@ -18,6 +18,7 @@ from jinja2 import FileSystemLoader
 from matplotlib.figure import Figure
 from scipy import stats
 
+from flowrep.report.cells import p_text, percent, points, signed
 from flowrep.report.figures import draw_bars, draw_curves, encoded, styled, words
 from flowrep.report.page import TEMPLATES
 from flowrep.report.runs import (
@@ -37,7 +38,6 @@ from flowrep.report.runs import (
     success_rate,
 )
 from flowrep.report.statistics import LEVEL, Array, Effect, Estimate, effect, mean_share
-from flowrep.report.tables import p_text, percent, points, signed
 from paper.archive import read_archives
 from paper.claims import (
     SHORT,

@@ -7,10 +7,10 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
 
+from flowrep.report.cells import listed
 from flowrep.report.figures import encoded, words
 from flowrep.report.runs import Run, scenes_of
 from flowrep.report.sections import Report
-from flowrep.report.tables import listed
 
 TEMPLATES = Environment(
     loader=FileSystemLoader(Path(__file__).parent),

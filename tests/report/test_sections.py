@@ -8,10 +8,11 @@ import pytest
 
 pytest.importorskip("scipy", reason="reports are an extra")
 
+from flowrep.report.cells import listed, p_text, percent, points, ratio
 from flowrep.report.runs import Condition, cell_of, changes, curve_of, paired_scores, read_runs
 from flowrep.report.sections import assemble
 from flowrep.report.statistics import Estimate
-from flowrep.report.tables import Table, listed, p_text, percent, points, ratio
+from flowrep.report.tables import Table
 from tests.report.folders import config_of, rows_of, run_in, write_run
 
 NORMAL = Condition("greedy", "normal", 12.0)
