@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from copy import deepcopy
 from functools import partial
 from itertools import pairwise
-from multiprocessing import current_process, forkserver, get_context, resource_tracker, util
+from multiprocessing import forkserver, get_context, resource_tracker, util
 from multiprocessing.connection import Connection
 from types import ModuleType
 from typing import Any
@@ -29,7 +29,6 @@ VectorFactory = Callable[[Sequence[EnvFactory]], SyncVectorEnv]
 
 _SIDE_BY_SIDE = partial(SyncVectorEnv, copy=False, autoreset_mode=AutoresetMode.DISABLED)
 
-ENVS_PER_WORKER = 24  # in an evaluation: fewer aren't worth starting a process
 PATIENCE_S = 300.0
 """How long a worker may take to answer: it starts in seconds and steps in milliseconds, but the
 machine may be busy."""
@@ -293,15 +292,6 @@ def sheltered() -> Iterator[None]:
     finally:
         sys.modules["__main__"] = main
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def worker_count(num_envs: int, busy_cores: int = 0) -> int:
-    """Returns the number of worker processes: one for each core that isn't busy."""
-    # In a pool of processes, as with hydra/launcher=joblib, the others use the other cores.
-    cores, is_in_pool = available_cores(), current_process().name != "MainProcess"
-    if is_in_pool or min(cores, num_envs) < 2:
-        return 0
-    return min(max(cores - busy_cores, 0), num_envs)
 
 
 def available_cores() -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
+from multiprocessing import current_process
 from pkgutil import resolve_name
 from typing import Any
 
@@ -18,9 +19,11 @@ from flowrep.config.options import FlowOptions, validated
 from flowrep.config.usage import UsageError
 from flowrep.envs import make_env, make_mirror
 from flowrep.envs.torchrl_env import usable_device
-from flowrep.envs.workers import ENVS_PER_WORKER, available_cores, sheltered, worker_count
+from flowrep.envs.workers import available_cores, sheltered
 from flowrep.experiment.schema import EnvConfig, TrainConfig
 from flowrep.transforms import representation_stack
+
+ENVS_PER_WORKER = 24  # in an evaluation: fewer aren't worth starting a process
 
 
 def env(config: EnvConfig, **changes: Any) -> EnvBase:
@@ -170,11 +173,20 @@ def training_workers(config: TrainConfig, device: torch.device) -> int:
     if config.num_workers != "auto":
         return config.num_workers
     # On a CPU, updates need cores of their own.
-    return worker_count(config.num_envs, config.threads if device.type == "cpu" else 0)
+    return _worker_count(config.num_envs, config.threads if device.type == "cpu" else 0)
 
 
 def evaluation_workers(config: EnvConfig, num_envs: int) -> int:
     """Returns the number of processes that step an evaluation's environments."""
     if config.num_workers != "auto":
         return min(config.num_workers, num_envs)
-    return worker_count(num_envs // ENVS_PER_WORKER)
+    return _worker_count(num_envs // ENVS_PER_WORKER)
+
+
+def _worker_count(num_envs: int, busy_cores: int = 0) -> int:
+    """Returns the number of worker processes: one for each core that isn't busy."""
+    # In a pool of processes, as with hydra/launcher=joblib, the others use the other cores.
+    cores, is_in_pool = available_cores(), current_process().name != "MainProcess"
+    if is_in_pool or min(cores, num_envs) < 2:
+        return 0
+    return min(max(cores - busy_cores, 0), num_envs)

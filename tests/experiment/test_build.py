@@ -104,7 +104,7 @@ def test_a_target_that_is_no_algorithm_is_refused(target, options, says):
 def test_workers_step_a_training_s_envs_where_cores_are_free(
     monkeypatch, cores, device, change, workers
 ):
-    monkeypatch.setattr("flowrep.envs.workers.available_cores", lambda: cores)
+    monkeypatch.setattr("flowrep.experiment.build.available_cores", lambda: cores)
     config = composed(change, "num_envs=4", "algorithm.batch_size=64")
     assert build.training_workers(config, torch.device(device)) == workers
 
@@ -124,7 +124,7 @@ def test_workers_step_a_training_s_envs_where_cores_are_free(
 def test_an_evaluation_is_stepped_by_a_process_a_core_if_each_has_enough_to_do(
     monkeypatch, cores, asked, num_envs, workers
 ):
-    monkeypatch.setattr("flowrep.envs.workers.available_cores", lambda: cores)
+    monkeypatch.setattr("flowrep.experiment.build.available_cores", lambda: cores)
     config = composed("device=cpu").model_copy(update={"num_workers": asked})
     assert build.evaluation_workers(config, num_envs) == workers
 
