@@ -20,7 +20,7 @@ from flowrep.config.options import validated
 from flowrep.config.usage import UsageError
 from flowrep.evaluate import candidates_of
 from flowrep.experiment.agents import Agent
-from flowrep.experiment.run import RunFolder, RunFolderError
+from flowrep.experiment.run import RunFolder
 from flowrep.experiment.schema import EvaluateConfig, ViewConfig
 from flowrep.train import resumed
 from flowrep.view import agent_of
@@ -148,13 +148,6 @@ def test_an_algorithm_that_is_no_section_is_refused(tmp_path, algorithm):
     run.write_config(plain("train", "debug=smoke") | {"algorithm": algorithm})
     with pytest.raises(UsageError, match="algorithm"):
         evaluate(run)
-
-
-def test_yaml_that_no_run_wrote_is_refused_in_a_line(tmp_path):
-    (tmp_path / "config.yaml").write_text("a: !!python/name:os.system")
-    with pytest.raises(RunFolderError, match=r"config\.yaml, line 1") as refused:
-        RunFolder(tmp_path).read_config()
-    assert "\n" not in str(refused.value)
 
 
 def test_nothing_in_a_stored_config_is_resolved(tmp_path, monkeypatch):

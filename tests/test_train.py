@@ -14,7 +14,6 @@ import yaml
 pytest.importorskip("pybullet", reason="training drives the simulated street")
 
 from flowrep.files import read_rows
-from flowrep.train import main
 from tests.running import ENVIRONMENT, run_here, run_python
 
 pytestmark = pytest.mark.slow
@@ -81,10 +80,7 @@ def test_a_device_or_class_that_is_not_there_leaves_no_folder(
     tmp_path, monkeypatch, capsys, missing
 ):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["train", missing])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 2
+    assert run_here(monkeypatch, ["python", "-m", "flowrep.train", missing]) == 2
     assert missing.lstrip("+") in capsys.readouterr().err
     assert not [*tmp_path.iterdir()]
 

@@ -64,16 +64,6 @@ def test_a_transition_of_three_steps_is_discounted_three_times(make_any, random_
     assert not torch.isclose(loss, agent.losses(once)["q_loss"])
 
 
-@pytest.mark.slow_after_first
-def test_the_learning_rate_ends_at_zero_with_the_frames(make_any, random_steps):
-    agent = make_any(total_frames=100, learning_rate=2**-10)
-    metrics = learn(agent, random_steps, 20)
-    rates = [m["learning_rate"].item() for m in metrics]
-    assert len(rates) == agent.total_updates
-    assert rates[0] == 2**-10
-    assert rates[-1] == pytest.approx(2**-10 / len(rates))
-
-
 def test_updates_from_replay_are_due_after_a_first_batch_and_then_every_ten_frames(make_agent):
     agent = make_agent(batch_size=16, frames_per_update=10)
     assert [agent.updates_due(frames) for frames in (0, 16, 25, 26, 66)] == [0, 0, 0, 1, 5]

@@ -139,14 +139,6 @@ def test_torchrls_own_checks_pass(make, representations, options):
     assert env.batch_size == (2,)
 
 
-def test_with_keep_sensor_exact_maps_stay_beside_noisy_ones(make):
-    env = make(representations=["obj"], noise=NOISE, keep_sensor=True, seed=0)
-    sensor = env.reset()["sensor"]
-    assert sensor["noisy_depth"].isnan().any()
-    assert not sensor["depth"].isnan().any()
-    assert not torch.equal(sensor["noisy_motion"], sensor["prev_from_curr"])
-
-
 def test_the_tensordict_has_the_representations_and_no_sensor(make):
     env = make(representations=["obj", "seg"], num_envs=2, seed=0)
     reset = env.reset()

@@ -176,6 +176,7 @@ def test_an_impossible_evaluation_is_refused_by_its_key(given, named):
         ("pretrained", {"scene": "s_turn", "num_envs": 0}, "num_envs"),
         ("pretrained", {"scene": "s_turn", "num_workers": "many"}, "num_workers"),
         ("pretrained", {"scene": "s_turn", "device": "gpu"}, "device"),
+        ("missing:make", {"scene": "s_turn"}, "representations"),
         ("missing:make", {"representations": "ego"}, r"\['ego'\]"),
         ("missing:make", {"representations": ["eog"]}, "eog"),
         ("missing:make", {"representations": ["ego"], "motion": "extact"}, "motion"),

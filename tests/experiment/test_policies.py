@@ -55,17 +55,6 @@ def test_a_policy_sees_its_maps_and_nothing_of_the_env():
     assert seen[0].batch_size == (2,)
 
 
-def test_make_receives_the_task_and_may_import_modules_beside_it(tmp_path):
-    (tmp_path / "my_net.py").write_text("SIDE = 1\n")
-    path = tmp_path / "mine.py"
-    path.write_text(
-        "import my_net\n"
-        "def make(task):\n"
-        "    return lambda maps: [my_net.SIDE * len(task.representations)] * len(maps)\n"
-    )
-    assert ForeignPolicy(f"{path}:make").built_for(TASK)(maps(3))["action"].tolist() == [2, 2, 2]
-
-
 def test_two_policies_import_their_own_modules_of_one_name(tmp_path):
     for number, name in enumerate(["first", "second"]):
         (tmp_path / name).mkdir()

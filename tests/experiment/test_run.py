@@ -117,7 +117,7 @@ def test_config_comes_back_as_written(tmp_path):
     assert run.read_config() == config.plain() | {"total_frames": 512}
 
 
-@pytest.mark.parametrize("text", ["", "- 1\n- 2\n", "seed: [1"])
+@pytest.mark.parametrize("text", ["", "- 1\n- 2\n", "seed: [1", "a: !!python/name:os.system"])
 def test_a_damaged_config_is_named(tmp_path, text):
     (tmp_path / "config.yaml").write_text(text)
     with pytest.raises(RunFolderError, match=r"config\.yaml"):

@@ -145,18 +145,14 @@ def test_a_sweep_finds_its_failed_runs_in_the_folder_that_was_typed(
         (tmp_path / run / sweep.LOG).write_text("--- failed: error: no space\n")
 
     monkeypatch.setattr(cli, "run_hydra", fail)
-    monkeypatch.setattr(sys, "argv", ["train", "-m", f"{plus}hydra.sweep.dir={tmp_path}"])
-    with pytest.raises(SystemExit) as ended:
-        sweep.run_sweep()
-    assert ended.value.code == 1
+    line = ["python", "-m", "flowrep.train", "--multirun", f"{plus}hydra.sweep.dir={tmp_path}"]
+    assert run_here(monkeypatch, line) == 1
 
 
 @pytest.mark.parametrize("plus", ["", "++"])
 def test_a_sweep_of_one_run_to_continue_is_refused(monkeypatch, capsys, plus):
-    monkeypatch.setattr(sys, "argv", ["flowrep-train", "-m", f"{plus}resume=outputs/a"])
-    with pytest.raises(SystemExit) as ended:
-        sweep.run_sweep()
-    assert ended.value.code == 2
+    line = ["python", "-m", "flowrep.train", "--multirun", f"{plus}resume=outputs/a"]
+    assert run_here(monkeypatch, line) == 2
     assert "hydra.sweep.dir=" in capsys.readouterr().err
 
 

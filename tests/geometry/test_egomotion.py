@@ -187,19 +187,6 @@ def test_a_body_over_49_percent_of_the_picture_is_never_the_world(size):
         assert (got.inlier_share - 0.51).abs().max() < 0.05, name  # of 1,536 pixels
 
 
-def test_a_body_on_the_very_pixels_that_are_scored_is_not_the_world():
-    height, width = 40, 48
-    depth, camera, world, body = scene_of(height, width, count=4)
-    pixel, _ = g.egomotion._shuffled(height, width, torch.device("cpu"))
-    mask = torch.zeros(height * width, dtype=torch.bool)
-    scored = g.egomotion.SCORED_PIXELS
-    mask[pixel[(torch.arange(scored) / scored * g.egomotion.PIXELS).long()]] = True  # 17 % of all
-    flow = torch.where(mask.reshape(height, width), body, world)
-    got = g.camera_motion(flow, depth, camera)
-    miss = g.ego_flow(depth, camera, got.prev_from_curr).flow - world
-    assert miss.norm(dim=1).max() < 0.05
-
-
 @pytest.mark.slow_after_first
 @pytest.mark.parametrize("size", SIZES[:4], ids=str)
 def test_movers_over_40_percent_and_noise_of_a_third_of_a_pixel(size):

@@ -43,18 +43,6 @@ def test_relative_motion_by_hand():
     torch.testing.assert_close(prev_from_curr[:3, :3], torch.eye(3))
 
 
-def test_invert_rigid_by_hand():
-    a_from_b = rigid((0.0, 0.0, QUARTER_TURN), (10.0, 20.0, 30.0))
-    # b's x axis is a's y axis: a's origin lies at -(20, -10, 30) in b. -t alone: (-10, -20, -30).
-    torch.testing.assert_close(g.invert_rigid(a_from_b)[:3, 3].tolist(), [-20.0, 10.0, -30.0])
-
-
-def test_relative_motion_is_the_product_of_poses():
-    expected = torch.linalg.inv(MOTION) @ OTHER_MOTION
-    got = g.relative_motion(MOTION, OTHER_MOTION, dtype=torch.float64)
-    torch.testing.assert_close(got, expected, rtol=0, atol=1e-14)
-
-
 @pytest.mark.parametrize("batch", [(), (3,), (2, 1)])
 def test_any_batch_equals_a_loop(batch):
     generator = torch.Generator().manual_seed(2)

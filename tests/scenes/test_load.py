@@ -85,7 +85,3 @@ def test_editors_explain_every_key():
 def test_scene_data_equals_the_file(file):
     written = yaml.safe_load(yaml.safe_dump(scene_data(load_scene(file))))
     assert written == yaml.safe_load(file.read_text(encoding="utf-8"))
-
-
-def test_a_key_with_its_default_is_the_same_as_no_key(data):
-    assert "terrain_m" not in scene_data(load_scene({**data, "terrain_m": 0.0}))

@@ -70,12 +70,6 @@ def test_people_look_where_they_walk_and_turn_about_at_the_ends(crowd):
     assert looks(2.8, 1) == pytest.approx(0.0)  # +x, round the corner
 
 
-def test_a_scene_may_be_without_people():
-    empty = Crowd([], np.zeros(0), np.zeros(0))
-    assert empty.poses(1.0).shape == (0, 4)
-    assert empty.positions(np.ones((2, 1))).shape == (2, 0, 2)
-
-
 def test_legs_swing_with_the_distance_walked(crowd):
     def swing(time_s, person):
         return crowd.poses(time_s)[person, 3]
