@@ -55,15 +55,16 @@ def test_a_policy_sees_its_maps_and_nothing_of_the_env():
     assert seen[0].batch_size == (2,)
 
 
-def test_two_policies_import_their_own_modules_of_one_name(tmp_path):
+def test_policies_get_their_task_and_import_their_own_modules_of_one_name(tmp_path):
     for number, name in enumerate(["first", "second"]):
         (tmp_path / name).mkdir()
         (tmp_path / name / "my_model.py").write_text(f"SIDE = {number}\n")
-        script = "import my_model\nmake = lambda task: lambda maps: [my_model.SIDE] * len(maps)"
+        act = "[my_model.SIDE * len(task.representations)] * len(maps)"
+        script = f"import my_model\nmake = lambda task: lambda maps: {act}"
         (tmp_path / name / "mine.py").write_text(script)
     paths = (f"{tmp_path}/{name}/mine.py:make" for name in ("first", "second", "first"))
     policies = [ForeignPolicy(path).built_for(TASK) for path in paths]
-    assert [each(maps())["action"].tolist() for each in policies] == [[0, 0], [1, 1], [0, 0]]
+    assert [each(maps())["action"].tolist() for each in policies] == [[0, 0], [2, 2], [0, 0]]
 
 
 @pytest.mark.parametrize(

@@ -66,6 +66,12 @@ def test_values_at_the_edge_of_what_is_possible_pass(line):
     assert composed(*line.split()).seed >= 0
 
 
+def test_a_final_evaluation_has_as_many_episodes_as_was_asked():
+    asked = "final_episodes=5", "speeds=[low,high]", "policies=[greedy]", "baselines=[random]"
+    config = composed(*(f"evaluation.{each}" for each in asked))
+    assert config.evaluation.final_total == 5 * 2 * 2
+
+
 def test_representations_keep_the_order_of_the_command_line():
     config = composed("representations=[seg2,ego,obj]")
     assert list(config.plain()["representations"]) == ["seg2", "ego", "obj"]
