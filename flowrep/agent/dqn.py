@@ -24,10 +24,7 @@ class EpsilonGreedyPolicy(TensorDictSequential):
     """Writes the action with the largest value or, with probability ε, a uniformly random one."""
 
     def __init__(
-        self,
-        network: PolicyNetwork,
-        keys: Sequence[NestedKey],
-        exploration: EGreedyModule,
+        self, network: PolicyNetwork, keys: Sequence[NestedKey], exploration: EGreedyModule
     ) -> None:
         super().__init__(
             TensorDictModule(network, keys, ["action_value"]),

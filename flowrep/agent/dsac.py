@@ -40,12 +40,7 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
     target_actor_encoder_params: TensorDictParams
     out_keys: ClassVar[list[str]] = [*METRICS.values()]
 
-    def __init__(
-        self,
-        actor: MapNetwork,
-        num_actions: int,
-        options: DiscreteSACOptions,
-    ) -> None:
+    def __init__(self, actor: MapNetwork, num_actions: int, options: DiscreteSACOptions) -> None:
         shared = options.encoder == "shared"
         with next(actor.parameters()).device:
             critic_encoder = actor.encoder

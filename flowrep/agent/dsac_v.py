@@ -45,10 +45,7 @@ class DiscreteSACValueLoss(LossModule):
     out_keys: ClassVar[list[str]] = [*METRICS.values()]
 
     def __init__(
-        self,
-        actor: MapNetwork,
-        num_actions: int,
-        options: DiscreteSACWithValueOptions,
+        self, actor: MapNetwork, num_actions: int, options: DiscreteSACWithValueOptions
     ) -> None:
         super().__init__()
         with next(actor.parameters()).device:

@@ -173,10 +173,7 @@ class PolicyNetwork(nn.Module):
 
 
 def stochastic_policy(
-    network: nn.Module,
-    in_keys: Sequence[NestedKey],
-    *,
-    writes_log_prob: bool = False,
+    network: nn.Module, in_keys: Sequence[NestedKey], *, writes_log_prob: bool = False
 ) -> ProbabilisticTensorDictSequential:
     """Returns a module that writes `action`, drawn from the softmax of the network's logits.
 

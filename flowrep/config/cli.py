@@ -116,10 +116,7 @@ def composed(schema: type[Model], values: Mapping[str, Any]) -> tuple[Model, str
     outer = get_gh_backup()  # of the script that calls, which may use Hydra itself
     GlobalHydra.instance().clear()
     try:
-        with (
-            _composing(typed),
-            hydra.initialize_config_dir(str(CONF_DIR), version_base="1.3"),
-        ):
+        with _composing(typed), hydra.initialize_config_dir(str(CONF_DIR), version_base="1.3"):
             config = hydra.compose("train", typed, return_hydra_config=True)
             return checked(config, schema), str(config.hydra.run.dir)
     finally:

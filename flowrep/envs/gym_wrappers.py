@@ -139,10 +139,7 @@ class RepresentationVectorObservation(gym.vector.VectorWrapper):
         self._now = TensorDict()
 
     def reset(
-        self,
-        *,
-        seed: Any = None,
-        options: dict[str, Any] | None = None,
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Maps, dict[str, Any]]:
         """Begins episodes, see `StreetVectorEnv.reset`."""
         begun = (options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool))

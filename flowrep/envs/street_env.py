@@ -17,14 +17,7 @@ from flowrep.envs.sensing import EPISODE_SEEDS, SENSORS, Sensing
 from flowrep.scenes.layout import Layout
 from flowrep.scenes.load import load_scene
 from flowrep.scenes.pedestrians import Crowd, draw_crowd
-from flowrep.scenes.scene import (
-    CATEGORIES,
-    CATEGORY_ID,
-    Range,
-    Scene,
-    check_speed,
-    num_classes,
-)
+from flowrep.scenes.scene import CATEGORIES, CATEGORY_ID, Range, Scene, check_speed, num_classes
 from flowrep.scenes.vehicle import YAW_SIGN, VehicleState, footprint_corners, roll, turn
 from flowrep.simulator.street import Street
 

@@ -21,13 +21,7 @@ from filelock import FileLock, Timeout
 
 from flowrep.config.usage import UsageError
 from flowrep.config.yaml_file import read_yaml
-from flowrep.experiment.outcomes import (
-    COLUMNS,
-    OUTCOMES,
-    EpisodeRecord,
-    columns_for,
-    read_episodes,
-)
+from flowrep.experiment.outcomes import COLUMNS, OUTCOMES, EpisodeRecord, columns_for, read_episodes
 from flowrep.experiment.schema import TrainConfig, validated_run
 from flowrep.files import (
     append_rows,

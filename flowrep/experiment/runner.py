@@ -26,12 +26,7 @@ from flowrep.agent import (
 from flowrep.agent.precision import has_bf16
 from flowrep.envs import WorkerError, begin_step, get_states, has_spare_cores, set_states
 from flowrep.experiment import build
-from flowrep.experiment.evaluation import (
-    EVALUATION_ENVS,
-    FIRST_SEEDS,
-    Driver,
-    PairedEvaluation,
-)
+from flowrep.experiment.evaluation import EVALUATION_ENVS, FIRST_SEEDS, Driver, PairedEvaluation
 from flowrep.experiment.outcomes import OUTCOMES, print_results
 from flowrep.experiment.provenance import check_origin, machine_of, origin_of
 from flowrep.experiment.run import RunFolder

@@ -98,12 +98,7 @@ def pixel_rays(height: int, width: int, K: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def intrinsics_from_fov(
-    fov_deg: float,
-    *,
-    axis: FovAxis,
-    height: int,
-    width: int,
-    pixel_aspect: float = 1.0,
+    fov_deg: float, *, axis: FovAxis, height: int, width: int, pixel_aspect: float = 1.0
 ) -> Tensor:
     """Returns K `[3, 3]` of a camera with a centred principal point.
 

@@ -141,10 +141,7 @@ class RAFT(nn.Module):
     """
 
     def __init__(
-        self,
-        weights: str | Path,
-        network: str = "raft_small",
-        min_side_px: int = SMALLEST_SIDE_PX,
+        self, weights: str | Path, network: str = "raft_small", min_side_px: int = SMALLEST_SIDE_PX
     ) -> None:
         super().__init__()
         check_name("network", network, Network)

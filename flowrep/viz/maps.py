@@ -150,9 +150,7 @@ class Tile(NamedTuple):
 
 
 def stock_tiles(
-    *,
-    flow_scale_px: Mapping[str, float] = FLOW_SCALE_PX,
-    depth_range_m: float = DEPTH_RANGE_M,
+    *, flow_scale_px: Mapping[str, float] = FLOW_SCALE_PX, depth_range_m: float = DEPTH_RANGE_M
 ) -> dict[str, Tile]:
     """Returns the tiles of rgb, seg, depth and flow, in the order in which they are drawn."""
     depth_colours = partial(depth_to_rgb, range_m=depth_range_m)

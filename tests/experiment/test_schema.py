@@ -4,12 +4,7 @@ import pytest
 
 from flowrep.config.options import validated
 from flowrep.config.usage import UsageError
-from flowrep.experiment.schema import (
-    EvaluateConfig,
-    TrainConfig,
-    ViewConfig,
-    validated_run,
-)
+from flowrep.experiment.schema import EvaluateConfig, TrainConfig, ViewConfig, validated_run
 from flowrep.factorize import FactorizeConfig
 from flowrep.report.__main__ import ReportConfig
 from flowrep.scenes import Scene

@@ -24,12 +24,7 @@ from flowrep.transforms import (
     SensorNoise,
     representation_stack,
 )
-from tests.transforms.fake_env import (
-    INTRINSICS,
-    WALKER,
-    FakeSensorEnv,
-    frame,
-)
+from tests.transforms.fake_env import INTRINSICS, WALKER, FakeSensorEnv, frame
 
 # fx = 40, fy = 20, cx = 2, cy = 1: pixel (column 1, row 0) sits at x~ = -0.5, y~ = -0.5.
 K = [[40.0, 0.0, 2.0], [0.0, 20.0, 1.0], [0.0, 0.0, 1.0]]

@@ -18,12 +18,7 @@ from torchrl.data import (
     Unbounded,
 )
 from torchrl.envs import TransformedEnv
-from torchrl.envs.transforms import (
-    Compose,
-    DTypeCastTransform,
-    MultiStepTransform,
-    ObservationNorm,
-)
+from torchrl.envs.transforms import Compose, DTypeCastTransform, MultiStepTransform, ObservationNorm
 
 from flowrep.transforms import Depth, FrameStack, Segmentation
 from tests.transforms.fake_env import NUM_CLASSES, FakeSensorEnv, moment
