@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any, ClassVar
+from typing import Any
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 """Ctrl-C; what schedulers send; a closed terminal; what SLURM's --signal=USR1@300 sends."""
@@ -99,9 +99,6 @@ class StopRequest:
     context ends. In another thread than the main one, a request never comes.
     """
 
-    was_received: ClassVar[bool] = False
-    """Whether a stop was requested in a context that has not ended yet: keep waits short then."""
-
     def __init__(self, then: Callable[[], Any] = lambda: None) -> None:
         self.received: signal.Signals | None = None
         self._then = then
@@ -124,7 +121,6 @@ class StopRequest:
         return self
 
     def __exit__(self, *_: object) -> None:
-        StopRequest.was_received = False
         for number, handler in self._previous.items():
             signal.signal(number, handler)
 
@@ -133,7 +129,6 @@ class StopRequest:
             _leave_closed_terminal()
         if self.received is None:
             self.received = signal.Signals(number)
-            StopRequest.was_received = True
             self._then()
         signal.signal(signal.SIGINT, self._previous[signal.SIGINT])
 

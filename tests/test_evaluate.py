@@ -1,5 +1,6 @@
 """`flowrep.evaluate` on agents of a few frames: what it runs, what it refuses, what it keeps."""
 
+import multiprocessing
 import os
 import signal
 from contextlib import closing, nullcontext
@@ -16,7 +17,7 @@ from flowrep.agent import CheckpointError
 from flowrep.baselines import BaselinePolicy
 from flowrep.config.options import validated
 from flowrep.config.usage import UsageError
-from flowrep.envs import WorkerError, workers
+from flowrep.envs import WorkerError
 from flowrep.evaluate import candidates_of
 from flowrep.evaluate import run as evaluate
 from flowrep.experiment import build
@@ -216,16 +217,10 @@ def test_a_run_that_can_not_be_evaluated_is_named_and_the_others_are(some, capsy
 
 
 @pytest.fixture
-def worker_processes(monkeypatch):
-    """The ids of the workers that were started."""
-    started, whole = [], workers._Worker.__init__
-
-    def start(worker, *arguments):
-        whole(worker, *arguments)
-        started.append(worker.process.pid)
-
-    monkeypatch.setattr(workers._Worker, "__init__", start)
-    return started
+def workers():
+    """Returns the ids of the processes that step envs."""
+    others = {*multiprocessing.active_children()}
+    return lambda: [each.pid for each in {*multiprocessing.active_children()} - others]
 
 
 MANY = ["speed=[low,high]", "episodes=8", "num_envs=4", "baselines=[never_turn]"]
@@ -239,7 +234,7 @@ def of_low_speed(rows):
 
 @pytest.mark.parametrize(("number", "num_workers"), [(signal.SIGINT, 0), (signal.SIGTERM, 2)])
 def test_an_evaluation_that_was_stopped_keeps_whole_groups_and_leaves_no_trace_once_run_again(
-    some, driver, worker_processes, number, num_workers
+    some, driver, workers, number, num_workers
 ):
     (whole, folder), config = some("good_1", "good_2", overrides=MANY)
     evaluate(config.model_copy(update={"run": [str(whole.path)]}))
@@ -247,26 +242,24 @@ def test_an_evaluation_that_was_stopped_keeps_whole_groups_and_leaves_no_trace_o
     assert len(rows) == 32
 
     def signal_all():  # as terminals and schedulers do
-        for process in (*worker_processes, os.getpid()):
+        assert len(workers()) == num_workers
+        for process in (*workers(), os.getpid()):
             os.kill(process, number)
 
     driver.at, driver.act = driver.steps + STEPS_OF_A_GROUP, signal_all
     again = config.model_copy(update={"run": [str(folder.path)]})
     with pytest.raises(SystemExit) as ended:
         evaluate(again.model_copy(update={"num_workers": num_workers}))
-    assert len(worker_processes) == num_workers
     assert ended.value.code == 128 + number
     assert folder.read_episodes() == of_low_speed(rows)
     evaluate(again)
     assert folder.evaluation_path.read_bytes() == whole.evaluation_path.read_bytes()
 
 
-def test_a_worker_that_is_killed_is_named_and_what_ended_before_is_kept(
-    some, driver, worker_processes
-):
+def test_a_worker_that_is_killed_is_named_and_what_ended_before_is_kept(some, driver, workers):
     (folder,), config = some("good", overrides=MANY)
-    driver.at, driver.act = STEPS_OF_A_GROUP, lambda: os.kill(worker_processes[0], signal.SIGKILL)
-    with pytest.raises(WorkerError, match=r"environments 0 to 1 is gone \(exit code -9\)"):
+    driver.at, driver.act = STEPS_OF_A_GROUP, lambda: os.kill(workers()[0], signal.SIGKILL)
+    with pytest.raises(WorkerError, match=r"environments \d to \d is gone \(exit code -9\)"):
         evaluate(config.model_copy(update={"num_workers": 2}))
     rows = folder.read_episodes()
     assert len(rows) == 8

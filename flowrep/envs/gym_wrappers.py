@@ -289,9 +289,8 @@ def _onehot(representations: Representations) -> dict[str, Any]:
 
 def _sensed(observation: Mapping[str, NDArray[Any]], batch: Sequence[int] = ()) -> TensorDict:
     tensors = {key: torch.from_numpy(np.asarray(each)) for key, each in observation.items()}
-    return TensorDict(
-        {"sensor": TensorDict(tensors, batch)}, batch
-    )  # nested dicts take twice as long
+    # A nested dict takes twice as long.
+    return TensorDict({"sensor": TensorDict(tensors, batch)}, batch)
 
 
 def _joined(maps: Iterable[NDArray[Any]]) -> NDArray[Any]:
