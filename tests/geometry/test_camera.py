@@ -63,13 +63,6 @@ def test_any_batch_equals_a_loop(batch):
     assert torch.equal(unproject(depth, K), unproject(depth, K.expand(*batch, 3, 3)))
 
 
-def test_camera_s_batch_is_the_leading_one_of_the_points():
-    Ks = torch.stack([camera(), camera(cx=0.0)])
-    points = torch.tensor([1.0, 2.0, 4.0]).expand(2, 5, 3)  # five points a camera
-    u = project(points, Ks)[..., 0]
-    assert u.tolist() == [[57.0] * 5, [25.0] * 5]
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.float16, torch.bfloat16])
 def test_dtype_is_kept(dtype):
     points = unproject(torch.full((1, 1, 2), 2.0, dtype=dtype), camera().to(dtype))

@@ -25,14 +25,6 @@ def test_float_types_may_differ(transform, points):
     assert points_world.tolist() == [[13.25, -0.5, -2.0]]
 
 
-def test_transform_points_by_hand():
-    # About z by a quarter turn, x goes to y: (1, 0, 0) -> (0, 1, 0), then + (10, 20, 30).
-    a_from_b = rigid((0.0, 0.0, QUARTER_TURN), (10.0, 20.0, 30.0))
-    points_a = g.transform_points(a_from_b, torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64))
-    # The inverse rotation would give (10, 19, 30).
-    torch.testing.assert_close(points_a[0].tolist(), [10.0, 21.0, 30.0])
-
-
 def test_relative_motion_by_hand():
     # Both cameras look along world y (their z); the current one stands 2 m further on.
     world_from_prev = rigid((-QUARTER_TURN, 0.0, 0.0), (5.0, 1.0, 0.0))

@@ -121,33 +121,3 @@ def test_ids_without_a_row_are_named_once_with_their_share():
     with pytest.warns(UserWarning, match=r"\b5 \(12.5%\)") as told:
         [transform(other.clone()) for _ in range(100)]
     assert len(told) == 1
-
-
-def test_pybullets_own_picture_of_links():
-    bullet = pytest.importorskip("pybullet")
-    client = bullet.connect(bullet.DIRECT)
-    try:
-        shape = bullet.createVisualShape(
-            bullet.GEOM_BOX, halfExtents=[0.1, 0.4, 0.4], physicsClientId=client
-        )
-        body = bullet.createMultiBody(  # the base on the left, its link on the right
-            *(1, -1, shape, [2, 0.5, 0]),
-            linkMasses=[1], linkCollisionShapeIndices=[-1], linkVisualShapeIndices=[shape],
-            linkPositions=[[0, -1, 0]], linkOrientations=[[0, 0, 0, 1]],
-            linkInertialFramePositions=[[0, 0, 0]], linkInertialFrameOrientations=[[0, 0, 0, 1]],
-            linkParentIndices=[0], linkJointTypes=[bullet.JOINT_FIXED], linkJointAxis=[[0, 0, 1]],
-            physicsClientId=client,
-        )  # fmt: skip
-        view = bullet.computeViewMatrix([0, 0, 0], [1, 0, 0], [0, 0, 1])
-        lens = bullet.computeProjectionMatrixFOV(60, 2.0, 0.1, 10.0)
-        flag = bullet.ER_SEGMENTATION_MASK_OBJECT_AND_LINKINDEX
-        ids = bullet.getCameraImage(
-            16, 8, view, lens, flags=flag, renderer=bullet.ER_TINY_RENDERER, physicsClientId=client
-        )[4]
-    finally:
-        bullet.disconnect(client)
-    middle = torch.as_tensor(ids).reshape(8, 16)[4]
-    rows = torch.tensor(rows_of(middle.tolist(), [(body, 0), (body, -1)]))
-    assert (rows[:8] != 1).all()
-    assert (rows[8:] != 2).all()
-    assert set(rows.tolist()) == {0, 1, 2}
