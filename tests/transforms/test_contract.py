@@ -14,9 +14,8 @@ from typing import NamedTuple
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv, check_env_specs
 from torchrl.envs.transforms import Compose, Transform
@@ -217,14 +216,6 @@ def test_in_a_batched_env_and_offline_to_the_last_bit(case, inputs):
             assert same_bits(offline["next", key], online["next", key])
     check_env_specs(env, seed=None)
     assert set(case.oracles) <= set(env.observation_spec.keys(True, True))
-
-
-@each_case
-def test_before_a_model(case, inputs):
-    key = next(iter(case.oracles))
-    double = TensorDictModule(lambda x: 2 * x, in_keys=[key], out_keys=["double"])
-    td = nn.Sequential(case.make(), double)(inputs)
-    assert same_bits(td["double"], 2 * td[key])
 
 
 @each_case
