@@ -16,7 +16,7 @@ QUARTER_TURN = torch.pi / 2
 
 @pytest.mark.parametrize("points", [torch.float16, torch.float32, torch.float64])
 @pytest.mark.parametrize("transform", [torch.float32, torch.float64])
-def test_float_types_may_differ(transform, points):
+def test_camera_points_become_world_points_in_the_wider_float_type(transform, points):
     # Seen along z at 3 m by a camera 10.25 m along x that looks along world x.
     world_from_cam = torch.tensor([[0, 0, 1, 10.25], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
     points_cam = torch.tensor([[0.5, 2.0, 3.0]], dtype=points)
