@@ -52,6 +52,15 @@ def test_the_sampled_intrinsics_put_unprojected_points_on_the_surface(slanted_pl
     np.testing.assert_allclose(same.K, camera.K, rtol=1e-6)
 
 
+def test_the_focal_length_follows_the_vertical_field_of_view():
+    # Half of 48 rows over tan(30°): 24 / 0.57735 = 41.569; the width plays no part.
+    camera = CameraConfig(48, 100, 60.0, 1.5, 0.0, 0.0, NEAR_M, FAR_M)
+    assert camera.focal_px == pytest.approx(24 * math.sqrt(3))
+    # The principal point is half a pixel right of the middle and above it, as measured above.
+    f = camera.focal_px
+    np.testing.assert_array_equal(camera.K, [[f, 0, 50.5], [0, f, 23.5], [0, 0, 1]])
+
+
 def test_the_mount_points_the_camera_forward_and_pitches_it_up():
     camera = CameraConfig(48, 48, 90.0, 1.5, 0.4, 30.0, NEAR_M, FAR_M)
     mount = camera.vehicle_from_cam

@@ -16,13 +16,21 @@ QUARTER_TURN = torch.pi / 2
 
 @pytest.mark.parametrize("points", [torch.float16, torch.float32, torch.float64])
 @pytest.mark.parametrize("transform", [torch.float32, torch.float64])
-def test_camera_points_become_world_points_in_the_wider_float_type(transform, points):
+def test_float_types_may_differ(transform, points):
     # Seen along z at 3 m by a camera 10.25 m along x that looks along world x.
     world_from_cam = torch.tensor([[0, 0, 1, 10.25], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
     points_cam = torch.tensor([[0.5, 2.0, 3.0]], dtype=points)
     points_world = g.transform_points(world_from_cam.to(transform), points_cam)
     assert points_world.dtype == torch.promote_types(transform, points)
     assert points_world.tolist() == [[13.25, -0.5, -2.0]]
+
+
+def test_transform_points_by_hand():
+    # About z by a quarter turn, x goes to y: (1, 0, 0) -> (0, 1, 0), then + (10, 20, 30).
+    a_from_b = rigid((0.0, 0.0, QUARTER_TURN), (10.0, 20.0, 30.0))
+    points_a = g.transform_points(a_from_b, torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64))
+    # The inverse rotation would give (10, 19, 30).
+    torch.testing.assert_close(points_a[0].tolist(), [10.0, 21.0, 30.0])
 
 
 def test_relative_motion_by_hand():
@@ -33,6 +41,18 @@ def test_relative_motion_by_hand():
     # What the current camera sees 0 m ahead was 2 m ahead. curr_from_prev would have -2.
     torch.testing.assert_close(prev_from_curr[:3, 3].tolist(), [0.0, 0.0, 2.0])
     torch.testing.assert_close(prev_from_curr[:3, :3], torch.eye(3))
+
+
+def test_invert_rigid_by_hand():
+    a_from_b = rigid((0.0, 0.0, QUARTER_TURN), (10.0, 20.0, 30.0))
+    # b's x axis is a's y axis: a's origin lies at -(20, -10, 30) in b. -t alone: (-10, -20, -30).
+    torch.testing.assert_close(g.invert_rigid(a_from_b)[:3, 3].tolist(), [-20.0, 10.0, -30.0])
+
+
+def test_relative_motion_is_the_product_of_poses():
+    expected = torch.linalg.inv(MOTION) @ OTHER_MOTION
+    got = g.relative_motion(MOTION, OTHER_MOTION, dtype=torch.float64)
+    torch.testing.assert_close(got, expected, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("batch", [(), (3,), (2, 1)])
