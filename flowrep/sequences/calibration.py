@@ -56,14 +56,19 @@ _COLMAP = {
     "SIMPLE_RADIAL_FISHEYE": "fl_x cx cy k1", "RADIAL_FISHEYE": "fl_x cx cy k1 k2",
     "OPENCV_FISHEYE": "fl_x fl_y cx cy k1 k2 k3 k4",
 }  # fmt: skip
+_MODELS = ["none", "plumb_bob", "rational_polynomial", "equidistant", "fisheye"]  # ROS's
+_MODELS += [*map(str.lower, _COLMAP), "is_fisheye", "fisheye_model"]
+# Keys of instant-ngp and OpenCV that say what the model is, some of which `_MODELS` has.
+_MODEL_KEYS = ("is_fisheye", "fisheye_model", "xi", "ftheta_p0", "latlong", "equirectangular")
+_FOCAL_KEYS = {"fl_x", "fl_y", "camera_angle_x", "camera_angle_y"}
 FILES = (".json", ".yaml", ".yml", "cameras.txt")
 
 
-def read_camera(path: Path) -> Camera:
-    """Returns the camera of an `intrinsics.json`, or of another tool's file.
+def read_cameras(path: Path) -> dict[str, Camera]:
+    """Returns the camera, named "", of an `intrinsics.json` or of another tool's file.
 
     These are COLMAP's `cameras.txt`, a YAML of ROS or OpenCV, a JSON of Open3D, and NeRF's
-    `transforms.json`.
+    `transforms.json`. Where that gives frames different cameras, they are named by their pictures.
     """
     remedy = (
         'it holds {"width": .., "height": .., "fx": .., "fy": .., "cx": .., "cy": .., '
@@ -71,14 +76,21 @@ def read_camera(path: Path) -> Camera:
         'picture, "distortion" and "lens"'
     )
     try:
-        text = regular(path).read_text("utf-8-sig", "replace")
-        if path.name.endswith(".txt"):
+        text, suffix = regular(path).read_text("utf-8-sig", "replace"), path.suffix.lower()
+        if suffix == ".txt":
             given = _colmap(path)
-        elif path.suffix == ".json":
+        elif suffix == ".json":
             given = json.loads(text)
         else:  # OpenCV begins with a directive and names types that YAML doesn't know
             given = yaml.safe_load(re.sub(r"^%.*|!!opencv-matrix", "", text, flags=re.MULTILINE))
-        return Camera.model_validate(_renamed(given) if isinstance(given, dict) else given)
+        given, cameras = dict(given), dict[str, Camera]()
+        frames = given.get("frames")
+        for number, frame in enumerate((isinstance(frames, list) and frames) or [{}]):
+            # A frame's focal length replaces the file's, even if one is an angle.
+            replaced = set() if _FOCAL_KEYS.isdisjoint(frame) else _FOCAL_KEYS
+            whole = {key: value for key, value in given.items() if key not in replaced} | frame
+            name = frame.get("file_path", f"frames.{number}")  # the latter is no picture's
+            cameras[name] = Camera.model_validate(_renamed(whole, path))
     except FileNotFoundError:
         raise SequenceError(path, f"no such file; {remedy}") from None
     except pydantic.ValidationError as error:
@@ -87,6 +99,10 @@ def read_camera(path: Path) -> Camera:
     except (*UNREADABLE, yaml.YAMLError) as error:
         says = f"is no {path.suffix[1:].upper()}: {' '.join(str(error).split())}"
         raise SequenceError(path, f"{says}; {remedy}") from None
+    first, *others = cameras.values()
+    if any((each.lens, each.distortion) != (first.lens, first.distortion) for each in others):
+        raise SequenceError(path, "has frames of different lenses: rectify their pictures")
+    return cameras if any(each != first for each in others) else {"": first}
 
 
 def _colmap(path: Path) -> dict[str, Any]:
@@ -95,13 +111,12 @@ def _colmap(path: Path) -> dict[str, Any]:
         remedy = "make one of all pictures, with --ImageReader.single_camera 1"
         raise SequenceError(path, f"holds {len(cameras)} cameras: {remedy}")
     _, model, width, height, *numbers = cameras[0]
-    if model not in _COLMAP:
-        raise SequenceError(path, f"has the lens model {model}; flowrep reads {', '.join(_COLMAP)}")
+    lens_of(model, path)  # or an error
     named = zip(_COLMAP[model].split(), map(float, numbers), strict=True)
     return {"w": int(width), "h": int(height), "camera_model": model, **dict(named)}
 
 
-def _renamed(given: dict[str, Any]) -> dict[str, Any]:
+def _renamed(given: dict[str, Any], path: Path) -> dict[str, Any]:
     """Returns the numbers of another tool's file, of ROS, OpenCV, Open3D or NeRF, by our names."""
 
     def of(*names: str) -> Any:
@@ -110,8 +125,9 @@ def _renamed(given: dict[str, Any]) -> dict[str, Any]:
 
     camera = {"width": of("width", "image_width", "w"), "height": of("height", "image_height", "h")}
     matrix = of("camera_matrix", "cameraMatrix", "intrinsic_matrix", "K", "k")
-    is_fisheye = given.get("is_fisheye") is True  # instant-ngp's, which names no model
-    lens = lens_of("fisheye" if is_fisheye else of("distortion_model", "camera_model"))
+    models = [given[key] for key in ("distortion_model", "camera_model") if given.get(key)]
+    models += [key for key in _MODEL_KEYS if given.get(key)]
+    lens: Lens = "fisheye" if "fisheye" in [lens_of(each, path) for each in models] else "opencv"
     if matrix is not None:
         K = camera_matrix(matrix, (1, 1), 0.5)
         camera["first_pixel_centre"] = 0.0
@@ -138,9 +154,13 @@ def _renamed(given: dict[str, Any]) -> dict[str, Any]:
     return camera
 
 
-def lens_of(model: str | None) -> Lens:
-    """Returns the lens that ROS, COLMAP or a NeRF tool calls by this name."""
-    return "fisheye" if re.search("fisheye|equidistant", str(model), re.IGNORECASE) else "opencv"
+def lens_of(model: object, source: object) -> Lens:
+    """Returns the lens that ROS, COLMAP or a NeRF tool calls by this name; refuses another."""
+    if (name := str(model).lower()) not in _MODELS:
+        says = f"has the lens model {model}; flowrep reads {', '.join(_MODELS)}"
+        remedy = "rectify the pictures, or give a folder's format.intrinsics, distortion and lens"
+        raise SequenceError(source, f"{says}: {remedy}")
+    return "fisheye" if re.search("fisheye|equidistant", name) else "opencv"
 
 
 def camera_matrix(

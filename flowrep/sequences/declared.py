@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
-from glob import escape
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -133,8 +132,7 @@ class DeclaredRecording(Recording):
         sources = [given] if isinstance(given, str) else [*(given or ())]
         for source in sources:
             path = self._path(source.rstrip("?").partition(":")[0], next="*")
-            name = escape(path.name).replace("[*]", "*")
-            if path.parent.is_dir() and any(path.parent.glob(name)):
+            if any(files.alike(path)):
                 continue
             if not source.endswith("?"):
                 raise SequenceError(f"format.{option}", f"there is no file {path}")
@@ -315,22 +313,23 @@ class DeclaredRecording(Recording):
 
     def _read_intrinsics(self) -> LeftOut:
         """Reads the numbers of K, of its lens, and of depth's camera if it is another."""
-        self._size = None
-        given = self.intrinsics
-        source = self._path(given) if isinstance(given, str) else "intrinsics"
-        if isinstance(given, str) and given.endswith(calibration.FILES):
-            camera = calibration.read_camera(self._path(given))
-            self._size = camera.height, camera.width  # of the camera of K
-            given = camera.numbers(self.first_pixel_centre)
+        self._sizes: list[tuple[int, int]] | None = None
+        given, rows = self.intrinsics, np.zeros(len(self._names), dtype=int)
+        source: Any = self._path(given) if isinstance(given, str) else "intrinsics"
+        if isinstance(given, str) and given.lower().endswith(calibration.FILES):
+            by_name = calibration.read_cameras(source)
+            cameras = [*by_name.values()]
+            if len(cameras) > 1:
+                (rows, _), _ = self._match(source, [*by_name], len(cameras), "name")
+            self._sizes = [(cameras[row].height, cameras[row].width) for row in rows]
+            numbers = np.array([camera.numbers(self.first_pixel_centre) for camera in cameras])
             if not self.distortion:
-                self.distortion, self.lens = camera.distortion, camera.lens
-        lacking = np.zeros(len(self._names), dtype=bool)
-        if isinstance(given, str) and ("*" in given or self.intrinsics_columns is not None):
+                self.distortion, self.lens = cameras[0].distortion, cameras[0].lens
+        elif isinstance(given, str) and ("*" in given or self.intrinsics_columns is not None):
             numbers, (rows, _), _ = self._table([given], self.intrinsics_columns, self.rows_by)
-            numbers, lacking = numbers[rows], rows < 0
         else:
             numbers = self._numbers_in(given)
-        self._K_numbers = numbers.repeat(len(lacking) // len(numbers), axis=0)
+        self._K_numbers = numbers[rows]
         self._camera(0, (2, 2), source)  # or an error, early
         self._depth_numbers = None
         pose: Any = calibration.fixed_pose(self.colour_from_depth, "colour_from_depth")
@@ -343,7 +342,7 @@ class DeclaredRecording(Recording):
         else:
             pose = None
         self._rig = calibration.Rig(self.distortion, self.lens, pose)
-        return {"without intrinsics": lacking}
+        return {"without intrinsics": rows < 0}
 
     def _numbers_in(self, given: str | Sequence[float]) -> Floats:
         table = files.read_table(self._path(given))[0] if isinstance(given, str) else given
@@ -375,7 +374,7 @@ class DeclaredRecording(Recording):
         rgb, source = self._picture(i)
         depth = self._stored_depth(i)
         size = depth.shape if rgb is None else rgb.shape[:2]
-        of_K = self._size or size
+        of_K = size if self._sizes is None else self._sizes[i]
         if of_K != size and not (self.resize_rgb and of_K == depth.shape):
             says = f"has {list(size)} rows and columns, intrinsics.json says {list(of_K)}"
             raise SequenceError(source, says)
@@ -445,8 +444,7 @@ class DeclaredRecording(Recording):
         options |= {"direction": "forward" if is_forward else "backward"}
         raw: files.FlowMap = geometry.adapt_flow(torch.from_numpy(stored), **options).numpy()
         for mask in self._flow_mask:
-            if self._file(mask, "map", name, **words).is_file():
-                raw[:, self._mask(mask, name, raw.shape[1:], **words) != 0] = np.nan
+            raw[:, self._mask(mask, name, raw.shape[1:], **words) != 0] = np.nan
         is_next = abs(self._numbers[i] - self._numbers[other]) == 1
         return raw, self._names[other] if is_next else None
 

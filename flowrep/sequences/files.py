@@ -11,7 +11,10 @@ import json
 import math
 import re
 import struct
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from fnmatch import fnmatchcase
+from glob import escape
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -51,13 +54,14 @@ def find_files(path: Path, kind: str) -> dict[str, Path]:
     """
     before, _, after = path.name.partition("*")
     any_suffix = not any(after.lower().endswith(_SUFFIXES[kind]) for kind in _SUFFIXES)
+    after = after if any_suffix else _folded(f"*{after}")[1:]
     found: dict[str, Path] = {}
     for file in path.parent.iterdir() if path.parent.is_dir() else ():
         if file.name.startswith(".") or not file.is_file():
             continue
         if any_suffix and file.suffix.lower() not in _SUFFIXES[kind]:
             continue
-        stem = file.stem if any_suffix else file.name
+        stem = file.stem if any_suffix else _folded(file.name)
         if stem.startswith(before) and stem.endswith(after):
             name = stem[len(before) : len(stem) - len(after)]
             if other := found.get(name):
@@ -84,11 +88,23 @@ def with_suffix(path: Path, kind: str) -> Path:
     if path.name.lower().endswith(_SUFFIXES[kind]):
         return path
     paths = [path.with_name(path.name + suffix) for suffix in _SUFFIXES[kind]]
-    return next((found for found in paths if found.exists()), path)
+    return next(chain(filter(Path.exists, paths), *map(alike, paths)), path)
+
+
+def alike(path: Path) -> Iterator[Path]:
+    """Yields the files of a name with or without `*`, whose suffix may be in capitals."""
+    name = escape(_folded(path.name)).replace("[*]", "*")
+    beginning = name.rpartition(".")[0].rstrip("*") + "*"  # for which glob is fast
+    return (x for x in path.parent.glob(beginning) if fnmatchcase(_folded(x.name), name))
+
+
+def _folded(name: str) -> str:
+    return Path(name).stem + Path(name).suffix.lower()
 
 
 def regular(path: Path, most_bytes: float = _MOST_BYTES) -> Path:
-    """Returns a path, unless it is a pipe, from which reading might never end, or very large."""
+    """Returns a file's path, unless it is a pipe, which might never end, or very large."""
+    path = path if path.exists() else next(alike(path), path)
     if path.exists() and not path.is_file():
         raise SequenceError(path, "is not a regular file")
     if path.exists() and path.stat().st_size > most_bytes:

@@ -7,7 +7,7 @@ import re
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from itertools import chain, islice, takewhile
+from itertools import chain, cycle, islice, takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -90,8 +90,10 @@ class RosBag(Recording):
             fixed = calibration.fixed_pose(frame_from_cam, "frame_from_cam")
             self._choose(stamps, depth_stamps, frame or optical, world, fixed)
             self._K_depth, colour_from_depth = self.K, None
+            self._depth_rig = calibration.Rig([], "opencv", None)  # before depth is registered
             if depth_optical != optical:
-                self._K_depth, _ = self._camera(None, self._depth)
+                self._K_depth, depth_lens = self._camera(None, self._depth)
+                self._depth_rig = calibration.Rig(*depth_lens, None)
                 colour_from_depth = self._between_cameras(optical, depth_optical)
             self._rig = calibration.Rig(*lens, colour_from_depth)
 
@@ -191,14 +193,18 @@ class RosBag(Recording):
         named = next((name for name in beside if name in there), None) if given is None else given
         source = self._topic("camera_info", named, there)
         _, info = next(self._messages(source))
-        is_ros1, size = hasattr(info, "K"), (info.height, info.width)
-        self._sizes[topic] = size
-        K, D, P = (info.K, info.D, info.P) if is_ros1 else (info.k, info.d, info.p)
+        size = self._sizes[topic] = info.height, info.width
+        names = ("K", "D", "P") if hasattr(info, "K") else ("k", "d", "p")
+        numbers = (getattr(each, name) for _, each in self._messages(source) for name in names)
+        K, D, P = first = tuple(islice(numbers, 3))
+        if not all(map(np.array_equal, numbers, cycle(first))):
+            raise SequenceError(self.path, f"{source} changes during the bag: cut it there")
         # ROS's name for pictures without distortion, of P, as in image_rect_color.
-        is_rectified = re.search("[/_]rect", topic) is not None
-        matrix = calibration.camera_matrix(P if is_rectified else K, size, 0.0, source)
-        distortion = [*D] if np.any(D) and not is_rectified else []
-        return matrix, (distortion, calibration.lens_of(info.distortion_model))
+        if re.search("[/_]rect", topic):
+            return calibration.camera_matrix(P, size, 0.0, source), ([], "opencv")
+        lens = calibration.lens_of(info.distortion_model or "none", f"{self.path}, {source}")
+        distortion = [*D] if np.any(D) else []
+        return calibration.camera_matrix(K, size, 0.0, source), (distortion, lens)
 
     # Where the camera was.
 
@@ -266,6 +272,7 @@ class RosBag(Recording):
             if (of_K := self._sizes.get(topic, size)) not in (size, (0, 0)):
                 says = f"has {list(size)} rows and columns, its camera_info says {list(of_K)}"
                 raise SequenceError(self.path, f"{topic} {says}: give format.camera_info=")
+        _, depth = self._depth_rig(None, depth, self._K_depth, self._K_depth)
         rgb, depth = self._rig(rgb, depth, self.K, self._K_depth)
         options: Any = {"timestamp_s": stamp * 1e-9, "position": position}
         return Frame(_name(stamp), self.path, pose, self.K, depth, rgb, **options)

@@ -94,7 +94,7 @@ def test_every_format_names_a_file_that_is_missing_or_empty(name, tmp_path):
     write, open_it, *_ = FORMATS[name]
     write(tmp_path)
     files = [path for path in tmp_path.rglob("*") if path.is_file()]
-    optional = ("timestamps.txt", "mask.npy", "poses.txt", "groundtruth.txt", "extrinsic.txt")
+    optional = ("timestamps.txt", "poses.txt", "groundtruth.txt", "extrinsic.txt")
     optional += ("pose_left.txt", "000000.pose.txt")
     # Where the pictures themselves are the list of frames, a missing one is a shorter recording.
     counted = [] if name == "frames" else [frame.source for frame in open_it(tmp_path)]

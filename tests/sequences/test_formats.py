@@ -12,7 +12,7 @@ pytest.importorskip("cv2", reason="recordings need OpenCV")
 import imageio.v3 as imageio
 
 from flowrep.sequences import factorize_frames, open_recording
-from tests.sequences import synthetic
+from tests.sequences import synthetic, test_tools
 from tests.sequences.synthetic import HEIGHT, WIDTH, K, make_moments, put, quaternion_line
 
 
@@ -94,6 +94,18 @@ def test_an_iphones_recording_has_a_camera_for_each_frame(name, tmp_path):
 
     for made in [*factorize_frames(recording, raw)][1:]:
         assert np.abs(made.obj).max() < 1e-3  # with the current K alone it would be 0.4 px
+
+
+def test_frames_of_nerf_may_have_a_camera_each(tmp_path):
+    test_tools.write("nerf", tmp_path)
+    given = json.loads((tmp_path / "transforms.json").read_text())
+    last, middle, _ = given["frames"]  # in that order
+    last["camera_angle_x"] = 2 * np.arctan(WIDTH / 2 / 50)  # fx and fy of 50 px
+    middle |= dict(zip(("fl_x", "fl_y", "cx", "cy"), camera(1, 1)))
+    put(tmp_path / "transforms.json", [json.dumps(given)])
+    expected = K, np.diag([1.02, 1.02, 1]) @ K, [[50, 0, 18.5], [0, 50, 13], [0, 0, 1]]
+    frames = open_recording(tmp_path, "nerf")
+    np.testing.assert_allclose([frame.K for frame in frames], expected)
 
 
 def test_pictures_of_a_video_in_any_order(tmp_path):

@@ -61,10 +61,13 @@ CAMERAS = {
 }  # fmt: skip
 
 
+@pytest.mark.parametrize("in_capitals", [False, True])
 @pytest.mark.parametrize("name", FORMATS | DECLARED)
-def test_what_was_written_is_read_and_object_flow_equals_the_truth(name, tmp_path):
+def test_what_was_written_is_read_and_object_flow_equals_the_truth(name, in_capitals, tmp_path):
     write, open_it, has_flow, backwards, step_px = (FORMATS | DECLARED)[name]
     moments = write(tmp_path)
+    for path in [path for path in tmp_path.rglob("*.*") if in_capitals and path.is_file()]:
+        path.rename(path.with_suffix(path.suffix.upper()))
     ordered = moments[::-1] if backwards else moments
     recording = open_it(tmp_path)
     assert (recording.has_flow, len(recording)) == (has_flow, len(moments))
@@ -135,6 +138,9 @@ def test_what_the_data_set_masks_is_unknown(name, tmp_path):
     raw = open_it(tmp_path)[2].raw
     assert np.isnan(raw[:, 4, 5]).all()
     assert np.isnan(raw).sum() == 2
+    if name == "sintel":  # the other frame with flow has no mask
+        with pytest.raises(OSError, match=r"invalid/cave/frame_0002\.png"):
+            open_it(tmp_path)[1]
 
 
 def test_zed_depth_beyond_its_range_is_missing(tmp_path):

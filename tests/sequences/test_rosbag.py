@@ -73,14 +73,14 @@ class Bag:
         fields |= {"header": self.header(ns, frame)}
         self.write(topic, "sensor_msgs/CompressedImage", ns + 5, **fields)
 
-    def info(self, topic, frame, lens=(), width=WIDTH):
+    def info(self, topic, frame, lens=(), width=WIDTH, model="plumb_bob"):
         roi = self.make("sensor_msgs/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0,
                         do_rectify=False)  # fmt: skip
         names = dict(zip("dkrp", "DKRP")) if self.is_ros1 else dict(zip("dkrp", "dkrp"))
         numbers = {"d": np.array(lens), "k": OPENCV_K.ravel(), "r": np.eye(3).ravel()}
         numbers |= {"p": np.hstack([OPENCV_K, np.zeros((3, 1))]).ravel()}
         fields = {names[name]: np.array(value, float) for name, value in numbers.items()}
-        fields |= {"height": HEIGHT, "width": width, "distortion_model": "plumb_bob", "roi": roi}
+        fields |= {"height": HEIGHT, "width": width, "distortion_model": model, "roi": roi}
         fields |= {"binning_x": 0, "binning_y": 0, "header": self.header(START_NS, frame)}
         self.write(topic, "sensor_msgs/CameraInfo", START_NS, **fields)
 
@@ -211,46 +211,64 @@ def test_a_pose_lies_between_the_transforms_around_its_picture(tmp_path):
 
 
 def test_depth_of_another_camera_is_registered_or_refused(tmp_path):
-    path, moments = write("sqlite3", tmp_path, optical="depth_optical")
+    path, _ = write("sqlite3", tmp_path, optical="depth_optical")
     with pytest.raises(SequenceError, match=r"depth_optical.*aligned"):
         open_recording(path, "rosbag")
     (tmp_path / "b").mkdir()
-    bag = Bag("sqlite3", tmp_path / "b")
+    # Seen at 1 m, two pixels to the right.
+    path, _ = write_one(tmp_path / "b", of="depth_optical", x_m=2 / 31)
+    assert np.isnan(open_recording(path, "rosbag")[0].depth[5]).nonzero()[0].tolist() == [0, 1]
+
+
+LENS = (0.2, 0.0, 0.0, 0.0, 0.0)
+
+
+def write_one(folder, *cameras, topic="/color/image", depth=1.0, of="optical", x_m=0.0, lens=()):
+    """A picture, what its camera_info says, and its depth in metres, of a frame and a lens."""
+    rgb, bag, beside = make_moments(unit_m=0.001)[0].rgb, Bag("ros1", folder), np.eye(4)
+    beside[0, 3] = x_m
     with bag.writer:
-        bag.info("/color/camera_info", "optical")
-        bag.info("/depth/camera_info", "depth_optical")
-        bag.transform("/tf_static", START_NS, "base", "optical", np.eye(4))
-        beside = np.eye(4)
-        beside[0, 3] = 2 / 31  # seen at 1 m, two pixels to the right
-        bag.transform("/tf_static", START_NS, "base", "depth_optical", beside)
-        wall = np.ones((HEIGHT, WIDTH), np.float32)
-        bag.image("/color/image", START_NS, "optical", "rgb8", moments[0].rgb)
-        bag.image("/depth/image", START_NS, "depth_optical", "32FC1", wall)
-    depth = open_recording(bag.path, "rosbag")[0].depth
-    assert np.isnan(depth[5]).nonzero()[0].tolist() == [0, 1]
+        for camera in cameras or [{}]:
+            bag.info(f"{topic.rpartition('/')[0]}/camera_info", "optical", **camera)
+        bag.info("/depth/camera_info", of, lens)
+        if of != "optical":
+            bag.transform("/tf_static", START_NS, "optical", of, beside)
+        bag.image(topic, START_NS, "optical", "rgb8", rgb)
+        whole = np.full((HEIGHT, WIDTH), depth, np.float32)
+        bag.image("/depth/image", START_NS, of, "32FC1", whole)
+    return bag.path, rgb
+
+
+def test_the_lens_of_a_depth_camera_is_taken_out_before_registration(tmp_path):
+    path, _ = write_one(tmp_path, depth=np.arange(WIDTH) + 1, of="depth_optical", lens=LENS)
+    # Column 33, at x = (33 - 18) / 31, is stored at x (1 + 0.2 x²), in column 33.7.
+    assert open_recording(path, "rosbag")[0].depth[12, 33] == 34 + 1
 
 
 @pytest.mark.parametrize(
-    ("topic", "is_bent"), [("/direct/image_raw", True), ("/color/image_rect_color", False)]
+    ("topic", "model", "is_bent"),
+    [
+        ("/direct/image_raw", "plumb_bob", True), ("/color/image_rect_color", "plumb_bob", False),
+        ("/color/image_rect_color", "omni", False),
+    ],
+)  # fmt: skip
+def test_only_pictures_that_are_called_rectified_keep_their_pixels(topic, model, is_bent, tmp_path):
+    path, rgb = write_one(tmp_path, {"lens": LENS, "model": model}, topic=topic)
+    assert np.array_equal(open_recording(path, "rosbag")[0].rgb, rgb) != is_bent
+
+
+@pytest.mark.parametrize(
+    ("cameras", "says"),
+    [
+        ([{"width": 2 * WIDTH}], r"/color/image has .*camera_info"),
+        ([{"model": "thin_prism"}], r"in\.bag, /color/camera_info: .* thin_prism;.*rectify"),
+        ([{}, {"lens": LENS}], r"/color/camera_info changes"),
+    ],
 )
-def test_only_pictures_that_are_called_rectified_keep_their_pixels(topic, is_bent, tmp_path):
-    rgb, bag = make_moments(unit_m=0.001)[0].rgb, Bag("ros1", tmp_path)
-    with bag.writer:
-        bag.info(f"{topic.rsplit('/', 1)[0]}/camera_info", "optical", [0.2, 0.0, 0.0, 0.0, 0.0])
-        bag.image(topic, START_NS, "optical", "rgb8", rgb)
-        bag.image("/depth", START_NS, "optical", "32FC1", np.ones((HEIGHT, WIDTH), np.float32))
-    assert np.array_equal(open_recording(bag.path, "rosbag")[0].rgb, rgb) != is_bent
-
-
-def test_a_calibration_of_larger_pictures_is_refused(tmp_path):
-    bag = Bag("ros1", tmp_path)
-    with bag.writer:
-        bag.info("/color/camera_info", "optical", width=2 * WIDTH)
-        grey, depth = np.zeros((HEIGHT, WIDTH), np.uint8), np.ones((HEIGHT, WIDTH), np.float32)
-        bag.image("/color/image", START_NS, "optical", "mono8", grey)
-        bag.image("/depth/image", START_NS, "optical", "32FC1", depth)
-    with pytest.raises(SequenceError, match=r"/color/image has .*camera_info"):
-        open_recording(bag.path, "rosbag")[0]
+def test_a_calibration_that_is_not_that_of_the_pictures_is_refused(cameras, says, tmp_path):
+    path, _ = write_one(tmp_path, *cameras)
+    with pytest.raises(SequenceError, match=says):
+        open_recording(path, "rosbag")[0]
 
 
 def test_topics_that_could_be_either_are_named(tmp_path):
