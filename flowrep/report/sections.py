@@ -1,6 +1,8 @@
 """The sections of a report on runs: which headings, figures and tables, and their files."""
 
+import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple
@@ -86,16 +88,31 @@ def assemble(runs: Sequence[Run], warnings: Sequence[str], policy: str = "greedy
 
 
 def write_files(report: Report, folder: Path) -> list[Path]:
-    """Writes figures as PNG and PDF, tables as CSV; returns the sections' folders."""
-    folders = [folder / section.folder for section in report.sections]
-    for section, path in zip(report.sections, folders):
-        refuse_link(path).mkdir(exist_ok=True)
+    """Writes figures as PNG and PDF, tables as CSV; returns the sections' folders.
+
+    Of the files of an earlier report, which `files.txt` lists, those that it lacks are removed.
+    """
+    contents: dict[str, bytes] = {}
+    for section in report.sections:
         if section.figure:
             for kind in ("png", "pdf"):
-                replace_bytes(path / f"{section.name}.{kind}", encoded(section.figure, kind))
+                contents[f"{section.folder}/{section.name}.{kind}"] = encoded(section.figure, kind)
         for table in section.tables:
-            replace_text(path / f"{table.name}.csv", table.to_csv())
-    return folders
+            contents[f"{section.folder}/{table.name}.csv"] = table.to_csv().encode()
+    for name, data in contents.items():
+        refuse_link((folder / name).parent).mkdir(exist_ok=True)
+        replace_bytes(folder / name, data)
+    listing = folder / "files.txt"
+    listed = listing.read_text("utf-8").splitlines() if listing.is_file() else []
+    for name in {*listed} - {*contents}:
+        # In a stranger's folder, the list may name any file.
+        if re.fullmatch(r"\w+/\w+\.(png|pdf|csv)", name):
+            refuse_link((folder / name).parent)
+            (folder / name).unlink(missing_ok=True)
+            with suppress(OSError):  # it holds other files
+                (folder / name).parent.rmdir()
+    replace_text(listing, "".join(f"{name}\n" for name in contents))
+    return [folder / section.folder for section in report.sections]
 
 
 def _why_unused(run: Run, policy: str) -> str | None:

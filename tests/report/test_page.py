@@ -49,7 +49,7 @@ def test_each_experiment_has_its_figure_and_tables_in_every_form(page):
     drawn = {f"{name}/{name}.{kind}" for name in names for kind in ("png", "pdf")}
     tables = {f"{name}/{name}_success" for name in names[:3]} | {"failure_causes/failure_causes"}
     tables |= {f"{name}/{name}_differences" for name in names[:2]}
-    assert found == drawn | {f"{name}.csv" for name in tables} | {"index.html"}
+    assert found == drawn | {f"{name}.csv" for name in tables} | {"index.html", "files.txt"}
 
 
 @pytest.mark.slow

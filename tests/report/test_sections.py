@@ -10,7 +10,7 @@ pytest.importorskip("scipy", reason="reports are an extra")
 
 from flowrep.report.cells import listed, p_text, percent, points, ratio
 from flowrep.report.runs import Condition, cell_of, changes, curve_of, paired_scores, read_runs
-from flowrep.report.sections import assemble
+from flowrep.report.sections import Report, ReportSection, assemble, write_files
 from flowrep.report.statistics import Estimate
 from flowrep.report.tables import Table
 from tests.report.folders import config_of, rows_of, run_in, write_run
@@ -227,3 +227,27 @@ def test_a_table_is_csv_with_its_headings_in_the_first_column():
     blocks = (("S-Turn", (("a_b", "85 [79–90]"),)), ("", (("c", "−3"),)))
     table = Table("t", "In %, 5 × 2.", ("what", "value (%)"), blocks)
     assert table.to_csv() == ("group,what,value (%)\nS-Turn,a_b,85 [79–90]\n,c,−3\n")
+
+
+def test_files_of_an_earlier_report_are_removed_and_no_others(tmp_path):
+    def write(*folders):
+        tables = (Table("success", "", ("stack",), ()),)
+        sections = (ReportSection("success", "", tables, folder=name) for name in folders)
+        write_files(Report((), (), tuple(sections)), out)
+
+    out, mine = tmp_path / "out", tmp_path / "mine" / "success.csv"
+    for path in (mine, out / "1_success" / "notes.csv"):
+        path.parent.mkdir(parents=True)
+        path.write_text("")
+    write("1_success", "2_success")
+    with (out / "files.txt").open("a") as file:
+        file.write(f"../mine/success.csv\n{mine}\n")
+    write("success")
+    left = {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}
+    assert left == {"files.txt", "success/success.csv", "1_success/notes.csv"}
+    assert not (out / "2_success").exists()
+    (out / "success").rename(tmp_path / "moved")
+    (out / "success").symlink_to(mine.parent)
+    with pytest.raises(OSError, match="link"):
+        write("1_success")
+    assert mine.is_file()
