@@ -108,9 +108,13 @@ def evaluate_one(
 
     agent, folder = candidate.load(), candidate.folder
     folder.read_episodes()  # a damaged table is refused before hours of episodes, not after
-    if not config.other_policies:  # whose networks may be large
-        build.share_cores(usable_device(agent.config.device), agent.config.flow)
     origin = agent.origin("evaluate")
+    if config.other_policies:
+        keys = {"representations", "flow", "motion", "noise"}
+        maps = {"order": [*agent.config.representations], **agent.config.model_dump(include=keys)}
+        folder.note_maps(candidate.policies[0], origin["scene_id"], maps)
+    else:  # the networks of other policies may be large
+        build.share_cores(usable_device(agent.config.device), agent.config.flow)
     # Agents of one scene share the baselines' episodes.
     rates = config.fps or [agent.config.scene.frame_rate_hz]
     episodes = config.speed, rates, config.episodes, config.seed

@@ -13,18 +13,19 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 pytest.importorskip("pybullet", reason="agents are evaluated in the simulated street")
 
 from examples import export_agent, share_agent
+from flowrep import view
 from flowrep.agent import CheckpointError
 from flowrep.baselines import BaselinePolicy
 from flowrep.config.options import validated
 from flowrep.config.usage import UsageError
 from flowrep.envs import WorkerError
-from flowrep.evaluate import candidates_of
+from flowrep.evaluate import candidates_of, main
 from flowrep.evaluate import run as evaluate
 from flowrep.experiment import build
 from flowrep.experiment.agents import Agent
 from flowrep.experiment.evaluation import PairedEvaluation
 from flowrep.experiment.policies import PolicyError
-from flowrep.experiment.run import RunFolder
+from flowrep.experiment.run import RunFolder, RunFolderError
 from flowrep.experiment.runner import Runner
 from flowrep.experiment.schema import EvaluateConfig
 from flowrep.files import TableError
@@ -102,6 +103,19 @@ def test_an_agent_drives_in_another_scene_and_changed_scenes_are_told_apart(unto
     assert [row["scene"] for row in rows] == ["straight_road"] * 4
     assert len({row["scene_id"] for row in rows}) == 2
     assert {row["length"] for row in rows} == {"3", "4"}
+
+
+@pytest.mark.parametrize(("key", "command"), [("run", main), ("policy", view.main)])
+def test_a_camera_that_was_typed_for_an_agent_that_keeps_its_own_is_refused(
+    key, command, run, monkeypatch, capsys
+):
+    # The scene's height differs, too, but was not typed.
+    line = [f"{key}={run.path}", "scene=s_turn", "++scene.camera.width_px=18"]
+    monkeypatch.setattr("sys.argv", ["flowrep", *line])
+    with pytest.raises(SystemExit) as ended:
+        command()
+    assert ended.value.code == 2
+    assert "error: scene.camera.width_px=18: " in capsys.readouterr().err
 
 
 def test_an_agent_that_reads_classes_drives_wherever_it_knows_them_all(tmp_path):
@@ -351,6 +365,20 @@ def test_a_policy_without_actions_leaves_a_line_and_no_row(tmp_path, capsys):
         own(f"{path}:make", tmp_path / "out", "representations=[seg]", "num_envs=1", "episodes=1")
     assert not (tmp_path / "out" / "videos").exists()
     assert capsys.readouterr().out == ""  # no table of no episodes, in a file that isn't there
+
+
+def test_episodes_of_a_policy_are_not_replaced_by_those_with_other_maps(tmp_path):
+    (tmp_path / "mine.py").write_text("def make(_):\n    return lambda maps: [0] * len(maps)\n")
+    name, first = f"{tmp_path}/mine.py:make", ["representations=[obj,depth]", SHORT, *SMALL]
+    rows = own(name, tmp_path / "out", *first)
+    turned = "representations=[depth,obj]"
+    for other in ("noise=depth_camera", turned):
+        with pytest.raises(RunFolderError, match=r"output="):
+            own(name, tmp_path / "out", *first, other)
+        (tmp_path / "out" / "maps.yaml").unlink(missing_ok=True)  # as in an older version's folder
+    # Episodes of another scene are others; those of the first are still there.
+    more = own(name, tmp_path / "out", *first, "scene.time_limit_steps=3", turned)
+    assert (more[:2], len(more)) == (rows, 4)
 
 
 def test_rows_of_another_policy_are_refused_in_a_runs_folder(run):

@@ -282,6 +282,12 @@ def _is_folder(key: str, value: str) -> bool:
     return key in FOLDERS and (os.path.exists(value) or not (is_camera or is_for_hydra))
 
 
+def typed_keys() -> set[str]:
+    """Returns the keys on the line of a command that is running, such as `scene.camera.fov_deg`."""
+    typed = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
+    return {text.lstrip("+").partition("=")[0] for text in typed}
+
+
 def value_of(text: str) -> str:
     """Returns the value of an override as text, without Hydra's quotes."""
     read = parsed(text)

@@ -8,16 +8,16 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, get_args
 
-from flowrep.config.cli import composed
+from flowrep.config.cli import composed, typed_keys
 from flowrep.config.options import BaselineName, validated
 from flowrep.config.usage import UsageError, closest_first
-from flowrep.experiment.provenance import check_origin, origin_of
+from flowrep.experiment.provenance import check_origin, differences, origin_of
 from flowrep.experiment.run import RunFolder
 from flowrep.experiment.schema import EnvConfig, Machine, TrainConfig, validated_run
 from flowrep.scenes import Scene, load_scene
@@ -117,7 +117,8 @@ class TrainedPolicy(NamedPolicy):
                         f"the agent in {path} reads classes and never saw {', '.join(new)} of "
                         f"scene '{given['scene'].name}': train one with scene.categories=all"
                     )
-            given["scene"] = replace(given["scene"], **seen)
+            given["scene"], asked = replace(given["scene"], **seen), given["scene"]
+            _check_not_typed(asked, given["scene"])
         config = trained.model_copy(update=given)
         with closing(build.env(config, num_envs=1)) as street:
             config = build.with_precision(config, street.device, precision or self.precision)
@@ -175,6 +176,14 @@ class SavedPolicy(TrainedPolicy):
         path = _pretrained(scene) if self.name == "pretrained" else Path(self.name)
         state = load_checkpoint(path, ["config", "frames", "policy"])
         return validated_run(state["config"], path.name, trusted), state, path
+
+
+def _check_not_typed(asked: Scene, kept: Scene) -> None:
+    """Checks that the command's line sets no key of a scene that an agent keeps as it was."""
+    keys = tuple(typed_keys() - {"scene"})
+    for key, value, trained in differences({"scene": asdict(asked)}, {"scene": asdict(kept)}):
+        if key.startswith(keys):
+            raise UsageError(f"{key}={value}: leave it out: agents keep their training's {trained}")
 
 
 def _check_is_there(name: str, file: str) -> None:

@@ -7,7 +7,7 @@ import os
 import platform
 import shutil
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -37,14 +37,20 @@ def check_origin(saved: Mapping[str, Any], expected: Mapping[str, Any], path: Pa
             f"{path} was written by flowrep {saved.get('flowrep')}, this is {expected['flowrep']}: "
             "install that version, or start a new run"
         )
-    there, here = flattened(saved), flattened(expected)
+    for key, was, now in differences(saved, expected):
+        raise CheckpointError(
+            f"{path} belongs to a run with {key}={was}, the config.yaml of its folder says "
+            f"{key}={now}: restore the file that was there, or start a new run"
+        )
+
+
+def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+    """Yields the dotted keys whose values differ, with both values."""
+    there, here = flattened(old), flattened(new)
     for key in {**there, **here}:
         was, now = there.get(key, "absent"), here.get(key, "absent")
         if was != now:
-            raise CheckpointError(
-                f"{path} belongs to a run with {key}={was}, the config.yaml of its folder says "
-                f"{key}={now}: restore the file that was there, or start a new run"
-            )
+            yield key, was, now
 
 
 def flattened(config: Mapping[str, Any], section: str = "") -> dict[str, Any]:

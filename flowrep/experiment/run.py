@@ -22,6 +22,7 @@ from filelock import FileLock, Timeout
 from flowrep.config.usage import UsageError
 from flowrep.config.yaml_file import read_yaml
 from flowrep.experiment.outcomes import COLUMNS, OUTCOMES, EpisodeRecord, columns_for, read_episodes
+from flowrep.experiment.provenance import differences
 from flowrep.experiment.schema import TrainConfig, validated_run
 from flowrep.files import (
     append_rows,
@@ -235,6 +236,23 @@ class RunFolder:
         """Writes what TensorBoard's writer still holds."""
         if self._tensorboard is not None:
             self._tensorboard.experiment.flush()
+
+    def note_maps(self, policy: str, scene_id: str, maps: dict[str, Any]) -> None:
+        """Notes in maps.yaml what a policy without a run sees in a scene.
+
+        Raises RunFolderError if it saw something else in episodes that the new ones would replace.
+        """
+        path, name = self.path / "maps.yaml", f"{policy} in scene {scene_id}"
+        noted = read_yaml(path) if path.is_file() else {}
+        for row in self.read_episodes():
+            if (row["policy"], row["scene_id"]) == (policy, scene_id):
+                before = maps | {"order": row["representations"].split("+")}  # without a note
+                for key, was, now in differences(noted.get(name, before), maps):
+                    raise RunFolderError(
+                        f"'{self.path}' holds episodes of {name} with {key}={was}; those with "
+                        f"{key}={now} would replace them: give another folder with output="
+                    )
+        replace_text(path, yaml.safe_dump(noted | {name: maps}, sort_keys=False))
 
     def save_episodes(self, records: Iterable[EpisodeRecord]) -> None:
         """Adds evaluated episodes to evaluation.csv, in place of earlier rows of the same episodes.
