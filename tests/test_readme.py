@@ -19,6 +19,13 @@ def test_the_readmes_python_runs_with_the_readers_own_env():
     assert set(namespace["rollout"].keys()) >= {"ego", "obj"}
 
 
+def test_every_picture_of_the_readme_is_there_and_small():
+    pictures = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", README.read_text(encoding="utf-8"))
+    assert pictures
+    for picture in pictures:
+        assert (README.parent / picture).stat().st_size < 600_000, picture
+
+
 OUTSIDE = ("*.md", "paper/*.md", "outputs/**/README.md", "flowrep/pretrained/*.md")
 
 
@@ -27,6 +34,17 @@ def test_links_of_pages_outside_of_docs_lead_somewhere(pattern):
     for page in README.parent.glob(pattern):
         links = re.findall(r"\]\(([^)#\s]+)(?:#[\w-]+)?\)", page.read_text(encoding="utf-8"))
         assert [x for x in links if "://" not in x and not (page.parent / x).exists()] == [], page
+
+
+def test_the_readmes_agents_are_those_of_the_results_and_of_the_trained_agents_card():
+    rows = README.read_text(encoding="utf-8").split("| pedestrians |")[1].splitlines()[2:5]
+    taught, demo = zip(*(line.split("|")[2:4] for line in rows))
+    results = (README.parent / "paper" / "results.md").read_text(encoding="utf-8")
+    (row,) = re.findall(r"^\|recipe 3.*\|SR\|`\[ego,obj\]`\|.*", results, re.MULTILINE)
+    assert [cell.strip() for cell in taught] == row.split("|")[5:8]
+    card = (README.parent / "flowrep" / "pretrained" / "README.md").read_text(encoding="utf-8")
+    row, *_ = re.findall(r"^\| Straight Road \|.*", card, re.MULTILINE)
+    assert [cell.split()[0] for cell in demo] == [f"{float(c):.0f}" for c in row.split("|")[2:5]]
 
 
 def test_every_page_and_make_install_the_same_torch():
