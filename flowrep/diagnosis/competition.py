@@ -13,7 +13,7 @@ from flowrep.diagnosis import explanation, fit, pictures, poses
 from flowrep.diagnosis.candidates import Candidate, candidate
 from flowrep.diagnosis.explanation import Explanation
 from flowrep.diagnosis.fit import EYE, Pairs, flow_of, length, median, residuals
-from flowrep.diagnosis.limits import REST_PX, SURE
+from flowrep.diagnosis.limits import SURE
 from flowrep.diagnosis.pictures import Metric, Mixture, Noise
 from flowrep.diagnosis.rivals import FAR, NO_RIVAL, OF_NOISE, STILL, Rival
 from flowrep.geometry.egomotion import motion_of_points
@@ -47,7 +47,6 @@ class Competition:
         likely = pictures.best_of(shown)
         self.ego_px = median(fit.middle(flow_of(pairs, pairs.motion))) if pairs.has_poses else 0.0
         self.flow_px = median(fit.middle(pairs.raw if pairs.by_flow else flow_of(pairs, likely)))
-        pairs = pairs._replace(smooth=_smooth(pairs, shown))
         own = torch.where(pairs.motion.isfinite(), pairs.motion, EYE) if pairs.has_poses else likely
         found = (candidate(pairs, rival, own, noise.px) for rival in self.rivals)
         of_poses: list[Candidate] = []
@@ -92,14 +91,8 @@ class Competition:
         return self.is_seen(other) and (null is None or other.nats - null.nats > SURE)
 
     def is_seen(self, other: Explanation) -> bool:
-        """Whether data show what it needs: raw flow beyond noise, or else a camera that moves.
-
-        Beside a camera at rest, flow shows bodies and noise, whatever its conventions.
-        """
-        of_flow = other.rival.subject == "flow"
-        if of_flow and self._has_poses and self.ego_px <= REST_PX:
-            return False
-        null = self.of_noise if of_flow else self.still
+        """Whether data show what it needs: raw flow beyond noise, or else a camera that moves."""
+        null = self.of_noise if other.rival.subject == "flow" else self.still
         return null is None or other.nats - null.nats > SURE
 
     def _explained(self, by: Candidate, motions: Tensor) -> Explanation:
@@ -183,31 +176,19 @@ def _starts(pairs: Pairs, closed: Sequence[Tensor]) -> Tensor:
 
 
 def _shown_by(pairs: Pairs, shown: Mixture, noise: Noise) -> Tensor:
-    """Returns motions that changed pictures show: those next to known ones, and a body's."""
+    """Returns motions that changed pictures show, next to known ones."""
     motion = pairs.motion
     if not pairs.has_poses:
         motion = motion_of_points(*_points(pairs), torch.ones_like(pairs.depth) > 0)
-    found = fit.refined(pairs, torch.stack([motion, pictures.best_of(shown)]), noise.px, 4)
-    number = shown.motions[..., 0, 0].isfinite().sum(0)
-    if not pairs.by_flow or (number > 1).double().mean() <= 0.5:
-        return found
-    size = length(residuals(pairs, found)).nan_to_num(math.inf)
-    near = size.nanquantile(0.2, -1, keepdim=True).argmin(0, keepdim=True)
-    left = size.gather(0, near.expand(1, *size.shape[1:]))[0] > 5 * noise.px
-    return torch.cat([found, _of_body(pairs, left, noise)])
+    return fit.refined(pairs, torch.stack([motion, pictures.best_of(shown)]), noise.px, 4)
 
 
 def _beside_bodies(pairs: Pairs, noise: Noise) -> Mixture:
     """Returns the recorded motions beside others: bodies pull fits of the world to them."""
     motion = torch.where(pairs.motion.isfinite(), pairs.motion, EYE)
     left = length(residuals(pairs, motion)) > 2 * noise.px
-    motions = torch.cat([motion.unsqueeze(0), _of_body(pairs, left, noise)])
-    return pictures.mixture(pairs, motions, noise)
-
-
-def _of_body(pairs: Pairs, left: Tensor, noise: Noise) -> Tensor:
-    """Returns a motion `[1, P, 4, 4]` of the pixels that are left."""
-    return fit.refined(pairs, motion_of_points(*_points(pairs), left).unsqueeze(0), noise.px, 4)
+    body = fit.refined(pairs, motion_of_points(*_points(pairs), left).unsqueeze(0), noise.px, 4)
+    return pictures.mixture(pairs, torch.cat([motion.unsqueeze(0), body]), noise)
 
 
 def _nearest(pairs: Pairs, pool: Tensor) -> Tensor:
@@ -228,13 +209,6 @@ def _of_likeliest(maps: Tensor, shown: Mixture, least: float) -> Tensor:
     odds, motion = shown.odds.max(0)
     own = maps.gather(0, motion[None, :, None].expand(1, -1, maps.shape[2], -1))[0]
     return torch.where(odds.unsqueeze(1) > least, own, math.nan)
-
-
-def _smooth(pairs: Pairs, shown: Mixture) -> Tensor:
-    """Returns raw flow without its noise, where a motion explains it."""
-    flow = flow_of(pairs, torch.where(shown.motions.isfinite(), shown.motions, EYE))
-    flow = _of_likeliest(flow, shown, 0.5)
-    return torch.where(flow.isnan(), pairs.shift, flow)
 
 
 def _points(pairs: Pairs) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -18,7 +18,7 @@ from torch import Tensor
 from flowrep.diagnosis.fit import Pairs, flow_of, length, median
 from flowrep.diagnosis.limits import BODY, FEW, PAIR, SURE
 from flowrep.diagnosis.pictures import Metric, Mixture, best_of
-from flowrep.diagnosis.poses import Poses, on_average
+from flowrep.diagnosis.poses import Poses
 from flowrep.diagnosis.rivals import Rival
 
 
@@ -85,11 +85,8 @@ class Explanation:
     @cached_property
     def systematic_px(self) -> tuple[float, float]:
         """The error that all recorded motions share, and twice its standard deviation."""
-        found = self.poses
-        assert found is not None
-        if not self.pairs.by_flow:  # the nearest of fits that are nearly as good hides an error
-            found = on_average(found, self.pairs.motion, self.shown, self.metric)
-        return found.shared_px(self.pairs.follows)
+        assert self.poses is not None
+        return self.poses.shared_px(self.pairs.follows)
 
     @property
     def motion(self) -> Tensor:

@@ -47,17 +47,15 @@ class Pairs(NamedTuple):
     distortion: Tensor = torch.zeros(1, 1).double()  # [P, 1], of the radius' square
     stretch: Tensor = torch.ones(1, 1).double()  # [P, N], depth's growth per that stored
     grain: float = 0.0  # noise of inverse depth from pixel to pixel, as a share of it
-    smooth: Tensor | None = None  # [P, 2, N], raw flow without noise, where a motion explains it
 
     def select(self, pairs: Any = slice(None), pixels: Any = slice(None)) -> Pairs:
         """Returns some of the pairs, with some of their pixels."""
         maps = [tensor[pairs][..., pixels] for tensor in self[:3]]
         gain = self.gain[pairs] if self.gain.ndim == 3 else self.gain
         bent = self.distortion[pairs] if len(self.distortion) > 1 else self.distortion
-        smooth = None if self.smooth is None else self.smooth[pairs][..., pixels]
         by = self.stretch[pairs][:, pixels] if self.stretch.numel() > 1 else self.stretch
         whole = [tensor[pairs] for tensor in self[3:8]]
-        return Pairs._make([*maps, *whole, *self[8:11], gain, bent, by, self.grain, smooth])
+        return Pairs._make([*maps, *whole, *self[8:11], gain, bent, by, self.grain])
 
     @staticmethod
     def joined(parts: Sequence[Pairs]) -> Pairs:
@@ -69,11 +67,6 @@ class Pairs(NamedTuple):
     def few(self) -> Pairs:
         """The pairs with the pixels that motions and numbers are fitted to."""
         return self.select(pixels=slice(_FITTED))
-
-    @property
-    def shift(self) -> Tensor:
-        """Where pixels come from, px: raw flow without its conventions and noise, [P, 2, N]."""
-        return torch.linalg.solve(self.gain, self.raw) if self.smooth is None else self.smooth
 
     @property
     def motion(self) -> Tensor:

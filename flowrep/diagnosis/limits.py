@@ -18,7 +18,6 @@ ALIKE_LEFT = 0.85
 SURE = 25.0
 PAIR = 10.0  # nats at most that a pair counts for or against an explanation, of few pairs more
 ALIKE = 3.0  # nats, twenty to one: explanations whose scores differ by less are alike
-ALIKE_SHARE = 0.7  # of a vague one's nats: a mistake with a name explains as much
 
 FEW = 3  # frames or pairs: fewer may show anything by chance; and explanations that are told
 MANY = 0.2  # of all pairs or pixels: they matter

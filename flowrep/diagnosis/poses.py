@@ -128,14 +128,6 @@ def compared(
     return Poses(y[at, pair], at, own, noise, noise_px, nats, is_bad & is_known)
 
 
-def on_average(found: Poses, motion: Tensor, shown: Mixture, by: Metric) -> Poses:
-    """Returns how motions differ from alternatives by their odds, instead of the nearest one."""
-    likely = shown.log_odds.argmax(0)
-    y = (shown.log_odds.softmax(0).unsqueeze(-1) * _deviation(motion, shown, by)).sum(0)
-    own = Metric(*(each[likely, torch.arange(len(y))] for each in by))
-    return found._replace(y=y, mode=likely, by=own)
-
-
 def _deviation(motion: Tensor, shown: Mixture, by: Metric) -> Tensor:
     """Returns what motions differ by from those of pictures, px, `[M, P, 6]`."""
     there = torch.where(shown.motions.isfinite(), shown.motions, EYE)

@@ -372,7 +372,7 @@ def _of_previous(pairs: Pairs, n: Tensor) -> Pairs:
 
 
 def _late_depth(pairs: Pairs, n: Tensor) -> Pairs:
-    return _reversed(pairs, pairs.pixel - pairs.shift, pairs.now)
+    return _reversed(pairs, pairs.pixel - torch.linalg.solve(pairs.gain, pairs.raw), pairs.now)
 
 
 # No mistakes, but what explains data that show nothing of what a mistake needs.

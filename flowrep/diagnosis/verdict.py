@@ -152,8 +152,6 @@ class _Case:
         least_px = max(self.harmless_px, self.bias_px, 2 * self.noise_px * self.pairs.is_estimated)
         if self.is_at_rest:
             least_px = max(least_px, self.rough_px)
-        if self.recorded.poses is not None:  # what pictures don't show is no mistake for certain
-            least_px = max(least_px, self.recorded.systematic_px[1])
         vague_px = max(self.unsure_px, least_px) + self.bias_px
         alike = self._likeliest(least_px, vague_px)
         if not alike:
@@ -180,28 +178,27 @@ class _Case:
             least_px: what a mistake with a name has to change flow by.
             vague_px: the same of one without.
         """
-        recorded, proven = self.recorded, [x for x in self.found.others if self.found.is_proven(x)]
+        recorded = self.recorded
+        possible = [each for each in self.found.others if self.found.is_proven(each)]
         if recorded.poses is not None:
             most_px = max(self.rough_px, limits.MOST_NOISE * recorded.deviation_px)
-            proven = [x for x in proven if x.deviation_px <= most_px]
-        proven = [x for x in proven if self._leaves_less(_left_px(x))]
-        effects_px = self.effects_px
-        matters = [effects_px[x] > (vague_px if x.rival.is_vague else least_px) for x in proven]
-        sure = {x: x.sure_nats(recorded) for x, does in zip(proven, matters) if does}
+            possible = [x for x in possible if x.deviation_px <= most_px]
+        sure = {
+            each: each.sure_nats(recorded)
+            for each in possible
+            if self.effects_px[each] > (vague_px if each.rival.is_vague else least_px)
+            and self._leaves_less(_left_px(each))
+        }
         most = max(sure.values(), default=0.0)
         ranked = sorted(sure, key=lambda each: (-min(sure[each], most - limits.ALIKE), -each.nats))
-        named = [each for each in ranked if not each.rival.is_vague]
-        if named and sure[named[0]] > limits.ALIKE_SHARE * sure[ranked[0]]:
-            ranked = named  # what is left may be a second mistake
         if not ranked or min(sure[ranked[0]], ranked[0].nats - recorded.nats) <= limits.SURE:
             return []
         first = ranked[0]
-        if any(x.sure_nats(first) > limits.SURE for x, does in zip(proven, matters) if not does):
-            return []  # what is wrong, if anything, is something that changes nothing
         if first.rival.is_vague:
             return [first]
         # Those that pairs don't agree to be worse than the first.
-        alike = [x for x in named if first.sure_nats(x) <= limits.ALIKE and sure[x] > 0]
+        named = [each for each in ranked if not each.rival.is_vague and sure[each] > 0]
+        alike = [each for each in named if first.sure_nats(each) <= limits.ALIKE]
         alike = sorted(alike, key=lambda each: -each.nats)
         # Of those with one subject, the ones with more numbers than needed say nothing more.
         fewest = {e.rival.subject: len(e.n) for e in sorted(alike, key=lambda e: -len(e.n))}
