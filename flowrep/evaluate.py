@@ -17,7 +17,7 @@ from flowrep.extras import require
 require("evaluation", "train", "hydra", "pydantic", module=__name__)
 
 from flowrep.config.cli import EXIT_USAGE, is_a_mistake, print_error, run_command
-from flowrep.config.folders import folder_name
+from flowrep.config.run_names import folder_name
 from flowrep.config.usage import UsageError
 from flowrep.experiment.schema import EvaluateConfig
 from flowrep.progress import StopRequest

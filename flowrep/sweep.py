@@ -29,7 +29,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from flowrep.config import cli
 from flowrep.config.config_dir import checked_files
-from flowrep.config.folders import OF_THE_MACHINE, register_resolvers, settings_of, sweep_run_name
+from flowrep.config.run_names import OF_THE_MACHINE, register_resolvers, settings_of, sweep_run_name
 from flowrep.config.usage import UsageError
 from flowrep.config.yaml_file import read_yaml
 from flowrep.experiment.outcomes import is_finished, success_of

@@ -21,8 +21,8 @@ from omegaconf import DictConfig
 
 from flowrep import sweep
 from flowrep.config.cli import checked, end_with, exit_with, line_for, run_command
-from flowrep.config.folders import OF_THE_MACHINE, settings_of
 from flowrep.config.options import validated
+from flowrep.config.run_names import OF_THE_MACHINE, settings_of
 from flowrep.config.usage import UsageError
 from flowrep.experiment.outcomes import is_finished
 from flowrep.experiment.schema import TrainConfig

@@ -16,7 +16,7 @@ from flowrep.extras import require
 require("viewing", "train", "hydra", "pydantic", "matplotlib", "imageio_ffmpeg", module=__name__)
 
 from flowrep.config.cli import run_command
-from flowrep.config.folders import folder_name
+from flowrep.config.run_names import folder_name
 from flowrep.config.usage import UsageError
 from flowrep.experiment.policies import policy_of
 from flowrep.experiment.schema import ViewConfig

@@ -25,7 +25,7 @@ from benchmarks.shots import draw, frames_of
 from flowrep import diagnose, diagnosis, geometry, transforms
 from flowrep.diagnosis import Examination
 from flowrep.diagnosis.explanation import agreed
-from flowrep.diagnosis.rivals import rivals_of
+from flowrep.diagnosis.mistakes import mistakes_of
 
 drawn = cache(draw)
 ROOM, NOISY, STREET_ENV, BODIES_ENV = 39, 45, 0, 3  # hand-held or hovering; the first is exact
@@ -114,7 +114,7 @@ def test_flow_that_mostly_follows_no_motion_is_not_called_right():
 def test_a_unit_by_which_all_is_far_away_explains_nothing():
     # Depth looks the same wherever the camera is on this street, and of far things always.
     _, found, _ = outcome(drawn(74154), *mistaken(drawn(74154), 74154))
-    assert "depth times 1.05e+03" in found.rivals_px
+    assert "depth times 1.05e+03" in found.corrected_px
     assert not found.suspects
 
 
@@ -342,8 +342,8 @@ def test_what_transforms_wrote_is_computed_again(frames):
 
 
 def test_no_layout_is_advised_for_poses_that_are_matrices():
-    rivals = rivals_of({"pose_layout": "matrix"}, by_flow=True, of_flow=True, absolute=True)
-    assert {x.remedy for x in rivals if x.description.startswith("quaternions")} == {
+    mistakes = mistakes_of({"pose_layout": "matrix"}, by_flow=True, of_flow=True, absolute=True)
+    assert {x.remedy for x in mistakes if x.description.startswith("quaternions")} == {
         "quaternions of wxyz", "quaternions of xyzw",
     }  # fmt: skip
 
@@ -351,8 +351,8 @@ def test_no_layout_is_advised_for_poses_that_are_matrices():
 def test_every_adapter_that_is_printed_for_an_env_can_be_made():
     adapters = (transforms.AdaptDepth, transforms.AdaptFlow, transforms.AdaptPose)
     names = {adapter.__name__: adapter for adapter in adapters} | {"K": torch.eye(3)}
-    rivals = rivals_of({}, by_flow=True, of_flow=True, absolute=True)
-    texts = [rival.texts(torch.tensor(rival.start[0]), width=64)[0] for rival in rivals]
+    mistakes = mistakes_of({}, by_flow=True, of_flow=True, absolute=True)
+    texts = [mistake.texts(torch.tensor(mistake.start[0]), width=64)[0] for mistake in mistakes]
     calls = {text: diagnosis.envs._adapter_call(text, None) for text in texts}
     made = [eval(call, names) for call in calls.values() if call.startswith("Adapt")]
     assert {*map(type, made)} == {*adapters}

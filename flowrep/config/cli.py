@@ -37,8 +37,8 @@ from flowrep import __version__
 from flowrep.config import CONF_DIR, config_groups, group_choices
 from flowrep.config.algorithms import ALGORITHMS
 from flowrep.config.config_dir import checked_files
-from flowrep.config.folders import register_resolvers
 from flowrep.config.options import Command, Model, validated
+from flowrep.config.run_names import register_resolvers
 from flowrep.config.usage import UsageError, closest_first
 
 EXIT_USAGE = 2

@@ -4,8 +4,8 @@ A camera motion predicts where each pixel was in the previous frame. The predict
 a reference: raw flow if it was measured or estimated, else the depth of the previous frame. The
 data as recorded compete with the same data after each usual mistake is undone, by one likelihood.
 
-`recordings` and `envs` make pairs of frames (`fit`). `rivals` lists the mistakes, `candidates` fits
-their numbers, `pictures` says what pairs show, `poses` how well recorded motions fit that,
+`recordings` and `envs` make pairs of frames (`fit`). `mistakes` lists the mistakes, `candidates`
+fits their numbers, `pictures` says what pairs show, `poses` how well recorded motions fit that,
 `explanation` scores both, `competition` has all explanations, and `verdict` says what follows.
 `limits` has what they decide by.
 """

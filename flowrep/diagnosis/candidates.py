@@ -1,4 +1,4 @@
-"""A rival's numbers, fitted to pairs of frames."""
+"""A mistake's numbers, fitted to pairs of frames."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ import torch
 from torch import Tensor
 
 from flowrep.diagnosis.fit import Pairs, gauss_newton, residuals
-from flowrep.diagnosis.rivals import Rival
+from flowrep.diagnosis.mistakes import Mistake
 
 # A fitted factor beyond these, or below their inverse, is no camera's and no unit's.
 _LARGEST_FACTORS = {"camera": 30.0, "depth": 1e5}
 
 
 class Candidate(NamedTuple):
-    """A rival with its numbers `[P, k]`, and the pairs as it changes them.
+    """A mistake with its numbers `[P, k]`, and the pairs as it changes them.
 
     `misfit` is the cost of the residuals, and `surprise` that of the numbers by their prior, nats.
     """
 
-    rival: Rival
+    mistake: Mistake
     n: Tensor
     pairs: Pairs
     misfit: float = 0.0
     surprise: float = 0.0
 
 
-def candidate(pairs: Pairs, rival: Rival, motion: Tensor, noise: Tensor) -> Candidate | None:
-    """Returns a rival with numbers that were fitted to the other half of the pairs.
+def candidate(pairs: Pairs, mistake: Mistake, motion: Tensor, noise: Tensor) -> Candidate | None:
+    """Returns a mistake with numbers that were fitted to the other half of the pairs.
 
     Of fewer than four pairs, all share a number. None if there are too few pairs, or if a factor is
     too large or too small.
@@ -38,14 +38,14 @@ def candidate(pairs: Pairs, rival: Rival, motion: Tensor, noise: Tensor) -> Cand
         motion: the recorded motions `[P, 4, 4]`, or those of the pictures in their place.
         noise: standard deviations of residuals `[P, N]`, px.
     """
-    count, k, few = len(noise), len(rival.start[0]), pairs.few
+    count, k, few = len(noise), len(mistake.start[0]), pairs.few
     noise = noise[:, : few.depth.shape[1]]
     if count < 4 and k > 1:
         return None
-    is_of_poses = (rival.subject == "poses" or rival.changes_poses) and few.has_poses
+    is_of_poses = (mistake.subject == "poses" or mistake.changes_poses) and few.has_poses
 
     def residuals_of(n: Tensor) -> Tensor:
-        changed = [rival.change(few, each) for each in n]
+        changed = [mistake.change(few, each) for each in n]
         return torch.stack([residuals(x, x.motion if is_of_poses else motion) for x in changed])
 
     def cost(n: Tensor) -> float:
@@ -53,13 +53,13 @@ def candidate(pairs: Pairs, rival: Rival, motion: Tensor, noise: Tensor) -> Cand
         # Depth that is looked up elsewhere is unknown at some pixels: they count as others do.
         return float(squared.log1p().nanmean(-1).nan_to_num(math.inf).mean())
 
-    starts = [noise.new_tensor(start).expand(count, k) for start in rival.start]
+    starts = [noise.new_tensor(start).expand(count, k) for start in mistake.start]
     if not k:
-        return Candidate(rival, starts[0], rival.change(pairs, starts[0]), cost(starts[0]))
+        return Candidate(mistake, starts[0], mistake.change(pairs, starts[0]), cost(starts[0]))
     every = torch.arange(count)
     half = every % 2 if count >= 4 else 0 * every
-    group = every if rival.per_pair else half
-    start, spread = min(starts, key=cost)[0], noise.new_tensor(rival.spread)
+    group = every if mistake.per_pair else half
+    start, spread = min(starts, key=cost)[0], noise.new_tensor(mistake.spread)
 
     def numbers(m: Tensor) -> Tensor:
         """Factors are fitted as their logarithms."""
@@ -68,7 +68,7 @@ def candidate(pairs: Pairs, rival: Rival, motion: Tensor, noise: Tensor) -> Cand
     m = noise.new_zeros(int(group.max()) + 1, k)
     m, _ = gauss_newton(lambda m: residuals_of(numbers(m)), m, group, noise, steps=5)
     n = numbers(m)
-    if rival.per_pair:
+    if mistake.per_pair:
         # A frame's number is taken from the fit to the other pair that has this frame.
         follows, own = pairs.follows, n
         if not follows.any():
@@ -78,11 +78,11 @@ def candidate(pairs: Pairs, rival: Rival, motion: Tensor, noise: Tensor) -> Cand
         n[1:, 1] = torch.where(follows, own[:-1, 0], own[1:, 1])
     else:
         n = n[half.max() - half]
-    if rival.in_pixels:
+    if mistake.in_pixels:
         n = (n * pairs.now.shape[-1]).round() / pairs.now.shape[-1]
-    first, most = n.new_tensor(rival.start[0]), _LARGEST_FACTORS.get(rival.subject, math.inf)
+    first, most = n.new_tensor(mistake.start[0]), _LARGEST_FACTORS.get(mistake.subject, math.inf)
     factors = n[:, first != 0] / first[first != 0]
     if not bool(((factors > 1 / most) & (factors < most)).all()):
         return None
     surprise = float(m.square().sum(-1).mean() / 2)
-    return Candidate(rival, n, rival.change(pairs, n), cost(n), surprise)
+    return Candidate(mistake, n, mistake.change(pairs, n), cost(n), surprise)

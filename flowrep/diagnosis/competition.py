@@ -14,8 +14,8 @@ from flowrep.diagnosis.candidates import Candidate, candidate
 from flowrep.diagnosis.explanation import Explanation
 from flowrep.diagnosis.fit import EYE, Pairs, flow_of, length, median, residuals
 from flowrep.diagnosis.limits import SURE
+from flowrep.diagnosis.mistakes import FAR, NO_MISTAKE, OF_NOISE, STILL, Mistake
 from flowrep.diagnosis.pictures import Metric, Mixture, Noise
-from flowrep.diagnosis.rivals import FAR, NO_RIVAL, OF_NOISE, STILL, Rival
 from flowrep.geometry.egomotion import motion_of_points
 
 _SCORED = 9  # corrections of the data that compete in full, those that fit best with exact poses
@@ -25,10 +25,10 @@ class Competition:
     """Explains pairs, with one noise for all explanations: the least that any of them leaves.
 
     Attributes:
-        rivals: those that the data let compete.
+        mistakes: those that the data let compete.
         recorded: the data as recorded.
-        others: each rival's.
-        of_noise: that raw flow is noise, if there are rivals that change raw flow.
+        others: the data after each mistake is undone.
+        of_noise: that raw flow is noise, if there are mistakes that change raw flow.
         far: that all is so far away that no motion but turns shows, if there are poses.
         still: that the camera stands still.
         noise: that of all explanations.
@@ -38,21 +38,21 @@ class Competition:
         rule_nats: what speaks for the rule.
     """
 
-    def __init__(self, pairs: Pairs, rivals: Sequence[Rival]) -> None:
+    def __init__(self, pairs: Pairs, mistakes: Sequence[Mistake]) -> None:
         if not pairs.by_flow and pairs.has_poses:
             pairs = _in_both_pictures(pairs)
         self._has_poses = pairs.has_poses  # at the ends of a recording, candidates may have none
-        self.rivals = [r for r in rivals if pairs.has_poses or r.subject != "poses"]
-        starts, shown, noise = _first_look(pairs, self.rivals)
+        self.mistakes = [x for x in mistakes if pairs.has_poses or x.subject != "poses"]
+        starts, shown, noise = _first_look(pairs, self.mistakes)
         likely = pictures.best_of(shown)
         self.ego_px = median(fit.middle(flow_of(pairs, pairs.motion))) if pairs.has_poses else 0.0
         self.flow_px = median(fit.middle(pairs.raw if pairs.by_flow else flow_of(pairs, likely)))
         own = torch.where(pairs.motion.isfinite(), pairs.motion, EYE) if pairs.has_poses else likely
-        found = (candidate(pairs, rival, own, noise.px) for rival in self.rivals)
+        found = (candidate(pairs, mistake, own, noise.px) for mistake in self.mistakes)
         of_poses: list[Candidate] = []
         of_data: list[Candidate] = []
         for each in (x for x in found if x is not None):
-            if each.rival.subject == "poses":
+            if each.mistake.subject == "poses":
                 of_poses.append(each)
             elif each.misfit < math.inf:  # a mirrored half of a picture may have no depth at all
                 of_data.append(each)
@@ -60,10 +60,10 @@ class Competition:
         scored = _SCORED if pairs.has_poses else len(of_data)
         of_data = sorted(of_data, key=lambda each: each.misfit)[:scored]
         recorded, still, of_noise, far = (
-            Candidate(rival, pairs.depth[:, :0], rival.change(pairs, pairs.depth[:, :0]))
-            for rival in (NO_RIVAL, STILL, OF_NOISE, FAR)
+            Candidate(mistake, pairs.depth[:, :0], mistake.change(pairs, pairs.depth[:, :0]))
+            for mistake in (NO_MISTAKE, STILL, OF_NOISE, FAR)
         )
-        has_flow = any(each.rival.subject == "flow" for each in of_data)
+        has_flow = any(each.mistake.subject == "flow" for each in of_data)
         nulls = [recorded] + [of_noise] * has_flow + [far] * pairs.has_poses
         motions = _motions([*nulls, *of_data], starts, shown, noise)
         noises = (_noise(each.pairs, own) for each, own in zip([*nulls, *of_data], motions))
@@ -87,28 +87,28 @@ class Competition:
 
     def is_proven(self, other: Explanation) -> bool:
         """Whether data also show K or depth, if it changes these: as far away, none matters."""
-        null = self.far if other.rival.subject in ("camera", "depth") else None
+        null = self.far if other.mistake.subject in ("camera", "depth") else None
         return self.is_seen(other) and (null is None or other.nats - null.nats > SURE)
 
     def is_seen(self, other: Explanation) -> bool:
         """Whether data show what it needs: raw flow beyond noise, or else a camera that moves."""
-        null = self.of_noise if other.rival.subject == "flow" else self.still
+        null = self.of_noise if other.mistake.subject == "flow" else self.still
         return null is None or other.nats - null.nats > SURE
 
     def _explained(self, by: Candidate, motions: Tensor) -> Explanation:
         """Returns a candidate that changes what pictures show, given motions `[M, P, 4, 4]`."""
         shown = pictures.mixture(by.pairs, motions, self.noise)
-        if by.rival is NO_RIVAL and by.pairs.by_flow and by.pairs.has_poses:
+        if by.mistake is NO_MISTAKE and by.pairs.by_flow and by.pairs.has_poses:
             shown = pictures.either(shown, _beside_bodies(by.pairs, self.noise))
         return self._scored(by, shown, pictures.metric(by.pairs, shown, self.noise))
 
     def _of_poses(self, by: Candidate) -> Explanation:
         """Returns a candidate that changes poses alone: pictures show what they do as recorded."""
         found = self._scored(by, self.recorded.shown, self.recorded.metric)
-        if by.rival.of_time:
+        if by.mistake.of_time:
             # Poses between two recorded ones have less noise: only what the opposite time doesn't
             # gain speaks for a delay.
-            pairs = by.rival.change(self.recorded.pairs, -found.n.expand(len(by.n), -1))
+            pairs = by.mistake.change(self.recorded.pairs, -found.n.expand(len(by.n), -1))
             back = self._scored(by._replace(pairs=pairs, surprise=0.0), found.shown, found.metric)
             gain = max(back.nats - self.recorded.nats, 0.0)
             found = replace(found, handicap=found.handicap + gain)
@@ -118,7 +118,7 @@ class Competition:
         of_poses, n = None, by.n.nanmedian(0).values
         if self._has_poses:
             of_poses = poses.compared(by.pairs.motion, shown, metric, *self._limits)
-        return Explanation(by.rival, n, by.pairs, shown, metric, of_poses, by.surprise)
+        return Explanation(by.mistake, n, by.pairs, shown, metric, of_poses, by.surprise)
 
 
 def _in_both_pictures(pairs: Pairs) -> Pairs:
@@ -131,11 +131,11 @@ def _in_both_pictures(pairs: Pairs) -> Pairs:
     return pairs._replace(depth=pairs.depth.masked_fill(~seen & is_most, math.nan))
 
 
-def _first_look(pairs: Pairs, rivals: Sequence[Rival]) -> tuple[Tensor, Mixture, Noise]:
+def _first_look(pairs: Pairs, mistakes: Sequence[Mistake]) -> tuple[Tensor, Mixture, Noise]:
     """Returns motions `[M, P, 4, 4]` as a start for fits, which the pictures show, and noise."""
     none = pairs.depth[:, :0]
     closed = [
-        r.change(pairs, none).motion for r in rivals if r.subject == "poses" and not r.start[0]
+        x.change(pairs, none).motion for x in mistakes if x.subject == "poses" and not x.start[0]
     ]
     starts = _starts(pairs, closed)
     starts = fit.refined(pairs, starts, _noise(pairs, starts).px)

@@ -22,7 +22,7 @@ from flowrep.diagnosis.fit import (
     residuals,
     seen_before,
 )
-from flowrep.diagnosis.rivals import rivals_of
+from flowrep.diagnosis.mistakes import mistakes_of
 from flowrep.diagnosis.verdict import Diagnosis, judged
 
 _ADAPTERS = {
@@ -93,9 +93,9 @@ def diagnose(
     if not used:
         return recordings.no_diagnosis(reasons)
     testable = torch.tensor(used)[_spread(len(used), limits.PAIRS)]
-    rivals = rivals_of({}, by_flow=is_measured, of_flow=is_measured, absolute=is_absolute)
+    mistakes = mistakes_of({}, by_flow=is_measured, of_flow=is_measured, absolute=is_absolute)
     names = [str(index) for index in kept[testable].tolist()]
-    result = judged(Competition(pairs.select(testable), rivals), names, _adapter_call)
+    result = judged(Competition(pairs.select(testable), mistakes), names, _adapter_call)
     faults, odd = _recomputed(seen, ego_key, obj_key)
     kind, of_bodies = ("", "") if result.is_wrong else _bodies(seen, result.left_px)
     odd += recordings.note_on_untested(reasons)

@@ -17,17 +17,17 @@ from torch import Tensor
 
 from flowrep.diagnosis.fit import Pairs, flow_of, length, median
 from flowrep.diagnosis.limits import BODY, FEW, PAIR, SURE
+from flowrep.diagnosis.mistakes import Mistake
 from flowrep.diagnosis.pictures import Metric, Mixture, best_of
 from flowrep.diagnosis.poses import Poses
-from flowrep.diagnosis.rivals import Rival
 
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """The data as recorded, or as a rival changes them."""
+    """The data as recorded, or after a mistake is undone."""
 
-    rival: Rival
-    n: Tensor  # [k], the rival's numbers
+    mistake: Mistake
+    n: Tensor  # [k], the mistake's numbers
     pairs: Pairs
     shown: Mixture
     metric: Metric
@@ -96,10 +96,10 @@ class Explanation:
     def effect_px(self, recorded: Explanation) -> float:
         """Returns how far ego or object flow differs from that of the data as recorded."""
         ego, other = (flow_of(each.pairs, each.motion) for each in (recorded, self))
-        other = -other if self.rival.reverses else other
+        other = -other if self.mistake.reverses else other
         apart = [other - ego]
         if self.pairs.by_flow:
-            gain = self.pairs.gain.expand(len(ego), 2, 2) * (-1 if self.rival.reverses else 1)
+            gain = self.pairs.gain.expand(len(ego), 2, 2) * (-1 if self.mistake.reverses else 1)
             raw = torch.linalg.solve(gain, self.pairs.raw)
             apart.append((raw - other) - (recorded.pairs.raw - ego))
         known = recorded.pairs.raw.isfinite().all(1) & ~recorded.pairs.depth.isnan()

@@ -42,7 +42,7 @@ class Pairs(NamedTuple):
     before: Tensor  # the same of the previous one
     by_flow: bool  # whether the reference is raw flow, not the depth of the previous frame
     is_estimated: bool  # whether flow was estimated from pictures
-    focal_px: float  # as recorded: residuals of depth are in it, whatever K a rival tries
+    focal_px: float  # as recorded: residuals of depth are in it, whatever K a mistake tries
     gain: Tensor = torch.eye(2).double()  # [(P,) 2, 2], raw is this times flow
     distortion: Tensor = torch.zeros(1, 1).double()  # [P, 1], of the radius' square
     stretch: Tensor = torch.ones(1, 1).double()  # [P, N], depth's growth per that stored

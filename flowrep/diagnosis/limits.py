@@ -14,7 +14,7 @@ MOST_NOISE = 0.25  # of flow's length: a larger error isn't taken for noise of s
 ALIKE_LEFT = 0.85
 
 # Nats that an explanation has to be better by: 15 are the odds of a hundred thousand to one for one
-# of fifty rivals; noise that pixels share doubles what chance gives.
+# of fifty mistakes; noise that pixels share doubles what chance gives.
 SURE = 25.0
 PAIR = 10.0  # nats at most that a pair counts for or against an explanation, of few pairs more
 ALIKE = 3.0  # nats, twenty to one: explanations whose scores differ by less are alike

@@ -14,7 +14,7 @@ from flowrep.diagnosis import fit
 from flowrep.diagnosis.competition import Competition
 from flowrep.diagnosis.fit import EYE, Pairs, sampled
 from flowrep.diagnosis.limits import FEW, FEW_PIXELS, MANY, REST_PX
-from flowrep.diagnosis.rivals import rivals_of
+from flowrep.diagnosis.mistakes import mistakes_of
 from flowrep.diagnosis.verdict import Diagnosis, judged
 
 _STILL = "hardly anything moves"
@@ -75,8 +75,8 @@ class Examination:
             return no_diagnosis(reasons)
         parts, names = zip(*(self._seen[i] for i in used))
         options = {"by_flow": True, "of_flow": self.flow_is_recorded, "absolute": True}
-        rivals = rivals_of(self.conventions, **options)
-        result = judged(Competition(Pairs.joined(parts), rivals), names, self._instruction)
+        mistakes = mistakes_of(self.conventions, **options)
+        result = judged(Competition(Pairs.joined(parts), mistakes), names, self._instruction)
         return replace(result, notes=(*result.notes, *note_on_untested(reasons)))
 
     def _instruction(self, remedy: str, corrected: Pairs) -> str:

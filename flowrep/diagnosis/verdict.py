@@ -13,9 +13,9 @@ from flowrep.diagnosis import limits
 from flowrep.diagnosis.competition import Competition
 from flowrep.diagnosis.explanation import Explanation
 from flowrep.diagnosis.fit import Pairs, length, median, middle, residuals
+from flowrep.diagnosis.mistakes import Mistake
 from flowrep.diagnosis.pictures import best_of
 from flowrep.diagnosis.poses import most_noise_px
-from flowrep.diagnosis.rivals import Rival
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Diagnosis:
         error_px: the error that all recorded motions may share. If the verdict is "right", the
             conventions are right to this many pixels. nan without poses.
         rough_px: the noise of single recorded motions.
-        rivals_px: median residual after each correction, by correction.
+        corrected_px: median residual after each correction, by correction.
         suspects: what corrects the data, the likeliest first; none if they are right.
         unseen: corrections that these data can neither confirm nor rule out.
         notes: further sentences: frames that stand out, and what could not be tested.
@@ -46,7 +46,7 @@ class Diagnosis:
     best_px: float = math.nan
     error_px: float = math.nan
     rough_px: float = math.nan
-    rivals_px: Mapping[str, float] = field(default_factory=dict)
+    corrected_px: Mapping[str, float] = field(default_factory=dict)
     suspects: tuple[str, ...] = ()
     unseen: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
@@ -65,9 +65,9 @@ class Diagnosis:
         lines = [f"{self.verdict}: {self.words}"]
         if self.pairs:
             rows = {"as recorded": self.left_px, "with the best motion": self.best_px}
-            order = {x: (x not in self.suspects, px) for x, px in self.rivals_px.items()}
+            order = {x: (x not in self.suspects, px) for x, px in self.corrected_px.items()}
             named = sorted(order, key=order.__getitem__)[: 5 * self.is_wrong]
-            rows |= {name[:52]: self.rivals_px[name] for name in named}
+            rows |= {name[:52]: self.corrected_px[name] for name in named}
             lines += [f"  {name:52} leaves {px:8.3f} px" for name, px in rows.items()]
             lines.append(f"  median flow {self.raw_px:.2f} px, {self.pairs} pairs of frames")
         if self.unseen:
@@ -82,7 +82,7 @@ def judged(
 
     Args:
         names: the names of the frames.
-        instruction: tells the user what to do, given `Rival.remedy` and the corrected pairs.
+        instruction: tells the user what to do, given `Mistake.remedy` and the corrected pairs.
     """
     case = _Case(found)
     return (
@@ -115,7 +115,7 @@ class _Case:
         is_biased = self.pairs.is_estimated
         self.bias_px = px + share * found.flow_px if is_biased else 0.0
         self.size = f"flow: {found.flow_px:.2g} px"
-        self.unknown = f"and none of {len(found.rivals)} known mistakes explains it"
+        self.unknown = f"and none of {len(found.mistakes)} known mistakes explains it"
         self.error_px = self.poses_px = math.nan
         if self.recorded.poses is not None:
             self.poses_px = max(self.recorded.deviation_px, *self.recorded.poses.noise_px)
@@ -130,15 +130,15 @@ class _Case:
             for each, px in self.effects_px.items()
             if each.nats > self.recorded.nats - limits.ALIKE
             and self.found.is_seen(each)
-            and px > limits.NOISE * noise.get(each.rival.subject, 0.0)
+            and px > limits.NOISE * noise.get(each.mistake.subject, 0.0)
         ]
 
     def _diagnosis(self, verdict: Any, words: str, **more: Any) -> Diagnosis:
         width, others = self.pairs.now.shape[-1], self.found.others
-        rivals_px = {each.rival.texts(each.n, width)[0]: _left_px(each) for each in others}
+        corrected_px = {each.mistake.texts(each.n, width)[0]: _left_px(each) for each in others}
         return Diagnosis(
             verdict, words, len(self.pairs.K), self.found.flow_px, self.left_px, self.best_px,
-            self.error_px, self.poses_px, rivals_px, notes=tuple(self.notes), **more,
+            self.error_px, self.poses_px, corrected_px, notes=tuple(self.notes), **more,
         )  # fmt: skip
 
     def _leaves_less(self, left_px: float) -> bool:
@@ -156,9 +156,9 @@ class _Case:
         alike = self._likeliest(least_px, vague_px)
         if not alike:
             return None
-        texts = [each.rival.texts(each.n, self.pairs.now.shape[-1]) for each in alike]
+        texts = [each.mistake.texts(each.n, self.pairs.now.shape[-1]) for each in alike]
         effects = [f"change flow by {self.effects_px[each]:.2g} px" for each in alike]
-        if alike[0].rival.is_vague:
+        if alike[0].mistake.is_vague:
             why = f"{texts[0][1]}, which would {effects[0]} ({self.size})"
             return self._diagnosis("something is wrong", f"{why}, {self.unknown} better")
         ways = (
@@ -186,7 +186,7 @@ class _Case:
         sure = {
             each: each.sure_nats(recorded)
             for each in possible
-            if self.effects_px[each] > (vague_px if each.rival.is_vague else least_px)
+            if self.effects_px[each] > (vague_px if each.mistake.is_vague else least_px)
             and self._leaves_less(_left_px(each))
         }
         most = max(sure.values(), default=0.0)
@@ -194,15 +194,15 @@ class _Case:
         if not ranked or min(sure[ranked[0]], ranked[0].nats - recorded.nats) <= limits.SURE:
             return []
         first = ranked[0]
-        if first.rival.is_vague:
+        if first.mistake.is_vague:
             return [first]
         # Those that pairs don't agree to be worse than the first.
-        named = [each for each in ranked if not each.rival.is_vague and sure[each] > 0]
+        named = [each for each in ranked if not each.mistake.is_vague and sure[each] > 0]
         alike = [each for each in named if first.sure_nats(each) <= limits.ALIKE]
         alike = sorted(alike, key=lambda each: -each.nats)
         # Of those with one subject, the ones with more numbers than needed say nothing more.
-        fewest = {e.rival.subject: len(e.n) for e in sorted(alike, key=lambda e: -len(e.n))}
-        simple = [each for each in alike if len(each.n) <= fewest[each.rival.subject] + 1]
+        fewest = {e.mistake.subject: len(e.n) for e in sorted(alike, key=lambda e: -len(e.n))}
+        simple = [each for each in alike if len(each.n) <= fewest[each.mistake.subject] + 1]
         return simple[: limits.FEW]
 
     def of_poses(self, names: Sequence[str]) -> Diagnosis | None:
@@ -280,7 +280,7 @@ class _Case:
         parts = "raw flow, " * self.pairs.by_flow + "depth, K, the camera's motion"
         words = f"{parts} agree to within {self.error_px:.2g} px {noise}"
         words += f" and poses' {self.poses_px:.2g} px"
-        unseen = _unseen(self.pairs, self.found.rivals, max(self.error_px, self.harmless_px))
+        unseen = _unseen(self.pairs, self.found.mistakes, max(self.error_px, self.harmless_px))
         return self._diagnosis("right", words, unseen=unseen)
 
 
@@ -288,14 +288,14 @@ def _left_px(each: Explanation) -> float:
     return median(middle(residuals(each.pairs, each.motion)))
 
 
-def _unseen(pairs: Pairs, rivals: Sequence[Rival], least: float) -> tuple[str, ...]:
+def _unseen(pairs: Pairs, mistakes: Sequence[Mistake], least: float) -> tuple[str, ...]:
     """Returns the corrections whose usual mistake would not change the residuals here."""
     pairs, unseen = pairs.few, []
     now = residuals(pairs, pairs.motion)
-    for rival in rivals:
-        if len(rival.usual) == len(rival.start[0]):
-            other = rival.change(pairs, now.new_tensor(rival.usual).expand(len(now), -1))
+    for mistake in mistakes:
+        if len(mistake.usual) == len(mistake.start[0]):
+            other = mistake.change(pairs, now.new_tensor(mistake.usual).expand(len(now), -1))
             apart = length(residuals(other, other.motion) - now)
             if median(apart.nanmedian(-1).values) <= least:
-                unseen.append(rival.name)
+                unseen.append(mistake.name)
     return tuple(unseen)

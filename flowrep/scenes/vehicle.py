@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from flowrep.scenes.scene import VehicleConfig
 
 NO_OP, TURN_LEFT, TURN_RIGHT = 0, 1, 2
-YAW_SIGN = (0.0, 1.0, -1.0)  # by action; left is counter-clockwise
+YAW_SIGN = (0.0, 1.0, -1.0)  # by action, which films name; left is counter-clockwise
 
 
 class VehicleState(NamedTuple):

@@ -7,8 +7,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf, open_dict
 
 from flowrep.config import CONF_DIR, config_groups
-from flowrep.config.folders import register_resolvers
 from flowrep.config.options import validated
+from flowrep.config.run_names import register_resolvers
 from flowrep.experiment.schema import TrainConfig
 
 

@@ -14,7 +14,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 import flowrep
-from flowrep.config import CONF_DIR, cli, folders
+from flowrep.config import CONF_DIR, cli, run_names
 from flowrep.config.usage import UsageError
 from tests.config.conftest import SCHEMAS
 
@@ -307,7 +307,7 @@ def test_a_value_may_be_longer_than_a_files_name():
 
 def test_run_folders_are_named_by_scene_representations_and_seed():
     def folder(*overrides):
-        folders.register_resolvers()
+        run_names.register_resolvers()
         with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
             return compose("train", list(overrides), return_hydra_config=True).hydra.run.dir
 
@@ -320,7 +320,7 @@ def test_run_folders_are_named_by_scene_representations_and_seed():
     "name", ["../../etc", "/etc", "..", "a/b", "..\\b", "x" * 500, "ä" * 500, "\udcff", ""]
 )
 def test_a_name_becomes_a_visible_folder_in_the_output_folder(name):
-    folder = folders.folder_name(name)
+    folder = run_names.folder_name(name)
     assert folder
     assert not folder.startswith(".")
     assert Path(folder).name == folder
@@ -329,10 +329,10 @@ def test_a_name_becomes_a_visible_folder_in_the_output_folder(name):
 
 def test_names_of_a_sweeps_runs_need_no_quotes_and_stay_apart():
     odd = ["+note='a b/../c'", "representations=[ego,obj]", "~debug", "num_workers=2"]
-    assert folders.sweep_run_name(odd) == "ego+obj_note-ab_.._c__debug"
+    assert run_names.sweep_run_name(odd) == "ego+obj_note-ab_.._c__debug"
     long = ["seed=3", *(f"evaluation.some_long_key_{i}=123456" for i in range(9))]
     other = [*long[:-1], "evaluation.some_long_key_8=123457"]
-    names = {folders.sweep_run_name(long), folders.sweep_run_name(other)}
+    names = {run_names.sweep_run_name(long), run_names.sweep_run_name(other)}
     assert len(names) == 2
     assert all(name.startswith("s3_") and len(name) < 120 for name in names)
 

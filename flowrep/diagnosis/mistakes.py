@@ -27,7 +27,7 @@ Change = Callable[[Pairs, Tensor], Pairs]  # of pairs, with numbers [P, k]
 _TURNS = tuple(tuple(3.0 * (i == j) for j in range(6)) for i in range(-1, 3))
 
 
-class Rival(NamedTuple):
+class Mistake(NamedTuple):
     """A mistake, and the change that undoes it.
 
     Attributes:
@@ -42,7 +42,7 @@ class Rival(NamedTuple):
             their logarithms.
         per_pair: whether the numbers differ from pair to pair.
         in_pixels: whether the numbers, shares of the width, are rounded to whole pixels after the
-            fit. Interpolated depth has less noise, for which alone the rival would win.
+            fit. Interpolated depth has less noise, for which alone the mistake would win.
         is_vague: whether it stands for many mistakes, and names none.
         of_time: whether it interpolates between poses.
         reverses: whether it looks at pairs of frames from the earlier one.
@@ -83,9 +83,9 @@ class Rival(NamedTuple):
         return self.remedy.format(*n, **values), self.description.format(*n, **values)
 
 
-def rivals_of(
+def mistakes_of(
     given: Mapping[str, str], *, by_flow: bool, of_flow: bool, absolute: bool
-) -> list[Rival]:
+) -> list[Mistake]:
     """Returns the table, relative to the options in force.
 
     Args:
@@ -96,7 +96,7 @@ def rivals_of(
     """
     given = {"pose_direction": "camera_to_world", "pose_axes": "opencv", "depth_kind": "z",
              "flow_direction": "forward", "flow_channels": "uv"} | {**given}  # fmt: skip
-    table: list[Rival] = []
+    table: list[Mistake] = []
     directions = get_args(geometry.PoseDirection) if absolute else [given["pose_direction"]]
     for direction, axes in product(directions, get_args(geometry.CameraAxes)):
         texts = {}
@@ -106,105 +106,111 @@ def rivals_of(
             texts[f"pose_axes={axes}"] = f"the camera's axes are {axes}"
         if texts:
             change = _path(partial(_readapted, given, direction, axes))
-            table.append(Rival("poses", " ".join(texts), " and ".join(texts.values()), change))
+            table.append(Mistake("poses", " ".join(texts), " and ".join(texts.values()), change))
     table += [
         # A world that is mirrored in y is Unity's, which is among the axes above.
-        Rival("poses", "mirrored in x", "the world is mirrored in x", _path(partial(_mirrored, 0))),
-        Rival("poses", "mirrored in z", "the world is mirrored in z", _path(partial(_mirrored, 2))),
-        Rival("poses", "motions inverted", "motions are curr_from_prev (time runs backwards)",
-              _path(lambda path: path.flip(1))),
-        Rival("poses", "pose_lag_frames=1", "poses are a frame late",
-              _path(lambda path: path[:, [1, 2, 3, 3]])),
-        Rival("poses", "pose_lag_frames=-1", "poses are a frame early",
-              _path(lambda path: path[:, [0, 0, 1, 2]])),
-        Rival("poses", "poses {0:.2f} frames later", "the times of poses are {0:.2f} frames late",
-              _later, ((0.0,),), (0.5,), of_time=True),
-        Rival("poses", "marker_from_cam={matrix}",
-              "the camera is turned on its mount, {degrees} degrees", _on_a_mount,
-              tuple(turn[:3] for turn in _TURNS), (0.1,) * 3),
-        Rival("poses", "marker_from_cam={matrix}",
-              "poses are a marker's or by angles in another order, {degrees} degrees off",
-              _on_a_mount, _TURNS, (0.1,) * 6),
-        Rival("camera", "K's numbers in another order", "K's numbers are fx, cx, fy, cy",
-              _camera(lambda fx, cx, fy, cy, w, h, n: (fx, fy, cx, cy))),
-        Rival("camera", "K in pixels", "K is in widths and heights",
-              _camera(lambda fx, cx, fy, cy, w, h, n: (w * fx, w * cx, h * fy, h * cy))),
-        Rival("camera", "K times {0:.3g}", "K is of pictures {inverse} times as large",
-              _camera(lambda *k: [k[-1][0] * x for x in k[:4]]), ((1.0,), (0.4,), (2.5,)), (1.25,)),
-        Rival("camera", "cx and cy moved by {px}", "the pictures were cropped, K was not",
-              _camera(lambda fx, cx, fy, cy, w, h, n: (fx, cx + w * n[0], fy, cy + w * n[1])),
-              ((0.0, 0.0), (0.5, 0.5)), (0.1, 0.1), (0.2, 0.2)),
-        Rival("camera", "fx times {0:.3g}, fy times {fy}, cx and cy moved by {px}",
-              "K is another camera's", _camera(lambda fx, cx, fy, cy, w, h, n: (
-                  fx * n[0], cx + w * n[2], fy * n[0] * n[1], cy + w * n[3])),
-              ((1.0, 1.0, 0.0, 0.0),), spread=(0.7, 0.2, 0.2, 0.2)),
-        Rival("camera", "a K for each frame", "K changes from frame to frame",
-              _zoomed, ((1.0, 1.0),), (1.01, 1.0), per_pair=True),
-        Rival("camera", "distortion=[{0:.2g},0,0,0]", "the lens bends the picture (calibrate it)",
-              lambda p, n: p._replace(distortion=n), ((0.0,),), (-0.2,)),
-        Rival("depth", "depth times {inverse}", "depth is {0:.3g} times as long as poses say",
-              _depth(lambda z, n: z / n.clamp(1e-6)),
-              tuple((n,) for n in (1.0, 0.1, 0.2, 0.35, 0.6, 1.7, 3.0, 5.0, 10.0, 1e-3, 1e3)),
-              (2.0,)),
-        Rival("depth", "depth_kind=disparity baseline_m={0:.3g}", "depth is a disparity",
-              lambda p, n: _depth(lambda d, by: by.clamp(1e-6) / d)(p, n * p.K[:, :1, 0]),
-              ((0.01,), (0.05,), (0.2,), (1.0,))),
-        Rival("depth", "depth_kind=z_buffer near_m={inverse} far_m={far}",
-              "depth is a buffer's", _depth(_from_buffer), ((5.0, -5.0),)),
-        Rival("depth", "depth isn't linear", "depth isn't metres times a unit",
-              _depth(lambda z, n: n[:, :1].clamp(1e-3) * z.clamp(1e-6) ** n[:, 1:].clamp(-3.0)),
-              ((1.0, 1.0), (1.0, 2.0)), is_vague=True),
-        Rival("depth", "depth plus an offset", "depth has an offset", _with_offset, ((0.0, 1.0),),
-              is_vague=True),
+        Mistake("poses", "mirrored in x", "the world is mirrored in x",
+                _path(partial(_mirrored, 0))),
+        Mistake("poses", "mirrored in z", "the world is mirrored in z",
+                _path(partial(_mirrored, 2))),
+        Mistake("poses", "motions inverted", "motions are curr_from_prev (time runs backwards)",
+                _path(lambda path: path.flip(1))),
+        Mistake("poses", "pose_lag_frames=1", "poses are a frame late",
+                _path(lambda path: path[:, [1, 2, 3, 3]])),
+        Mistake("poses", "pose_lag_frames=-1", "poses are a frame early",
+                _path(lambda path: path[:, [0, 0, 1, 2]])),
+        Mistake("poses", "poses {0:.2f} frames later", "the times of poses are {0:.2f} frames late",
+                _later, ((0.0,),), (0.5,), of_time=True),
+        Mistake("poses", "marker_from_cam={matrix}",
+                "the camera is turned on its mount, {degrees} degrees", _on_a_mount,
+                tuple(turn[:3] for turn in _TURNS), (0.1,) * 3),
+        Mistake("poses", "marker_from_cam={matrix}",
+                "poses are a marker's or by angles in another order, {degrees} degrees off",
+                _on_a_mount, _TURNS, (0.1,) * 6),
+        Mistake("camera", "K's numbers in another order", "K's numbers are fx, cx, fy, cy",
+                _camera(lambda fx, cx, fy, cy, w, h, n: (fx, fy, cx, cy))),
+        Mistake("camera", "K in pixels", "K is in widths and heights",
+                _camera(lambda fx, cx, fy, cy, w, h, n: (w * fx, w * cx, h * fy, h * cy))),
+        Mistake("camera", "K times {0:.3g}", "K is of pictures {inverse} times as large",
+                _camera(lambda *k: [k[-1][0] * x for x in k[:4]]),
+                ((1.0,), (0.4,), (2.5,)), (1.25,)),
+        Mistake("camera", "cx and cy moved by {px}", "the pictures were cropped, K was not",
+                _camera(lambda fx, cx, fy, cy, w, h, n: (fx, cx + w * n[0], fy, cy + w * n[1])),
+                ((0.0, 0.0), (0.5, 0.5)), (0.1, 0.1), (0.2, 0.2)),
+        Mistake("camera", "fx times {0:.3g}, fy times {fy}, cx and cy moved by {px}",
+                "K is another camera's", _camera(lambda fx, cx, fy, cy, w, h, n: (
+                    fx * n[0], cx + w * n[2], fy * n[0] * n[1], cy + w * n[3])),
+                ((1.0, 1.0, 0.0, 0.0),), spread=(0.7, 0.2, 0.2, 0.2)),
+        Mistake("camera", "a K for each frame", "K changes from frame to frame",
+                _zoomed, ((1.0, 1.0),), (1.01, 1.0), per_pair=True),
+        Mistake("camera", "distortion=[{0:.2g},0,0,0]", "the lens bends the picture (calibrate it)",
+                lambda p, n: p._replace(distortion=n), ((0.0,),), (-0.2,)),
+        Mistake("depth", "depth times {inverse}", "depth is {0:.3g} times as long as poses say",
+                _depth(lambda z, n: z / n.clamp(1e-6)),
+                tuple((n,) for n in (1.0, 0.1, 0.2, 0.35, 0.6, 1.7, 3.0, 5.0, 10.0, 1e-3, 1e3)),
+                (2.0,)),
+        Mistake("depth", "depth_kind=disparity baseline_m={0:.3g}", "depth is a disparity",
+                lambda p, n: _depth(lambda d, by: by.clamp(1e-6) / d)(p, n * p.K[:, :1, 0]),
+                ((0.01,), (0.05,), (0.2,), (1.0,))),
+        Mistake("depth", "depth_kind=z_buffer near_m={inverse} far_m={far}",
+                "depth is a buffer's", _depth(_from_buffer), ((5.0, -5.0),)),
+        Mistake("depth", "depth isn't linear", "depth isn't metres times a unit",
+                _depth(lambda z, n: n[:, :1].clamp(1e-3) * z.clamp(1e-6) ** n[:, 1:].clamp(-3.0)),
+                ((1.0, 1.0), (1.0, 2.0)), is_vague=True),
+        Mistake("depth", "depth plus an offset", "depth has an offset", _with_offset, ((0.0, 1.0),),
+                is_vague=True),
     ]  # fmt: skip
     is_z = given["depth_kind"] != "ray_length"
     kind, what = ("ray_length", "the ray's length") if is_z else ("z", "z, not the ray's length")
     change = partial(_along_ray, -1 if is_z else 1)
-    table.append(Rival("depth", f"depth_kind={kind}", f"depth is {what}", change))
+    table.append(Mistake("depth", f"depth_kind={kind}", f"depth is {what}", change))
     if absolute:
         first, last = (_path(partial(_rolled, places)) for places in (-1, 1))
         layout = given.get("pose_layout", "xyz_xyzw")
         # An option can't mend matrices that were made of quaternions.
         option = "pose_layout=xyz_" if "xyzw" in layout or "wxyz" in layout else "quaternions of "
         table += [
-            Rival("poses", f"{option}wxyz", "quaternions have w first", first),
-            Rival("poses", f"{option}xyzw", "quaternions have w last", last),
-            Rival("poses", "rotations transposed", "rotations are by columns", _path(_transposed)),
-        ]
+            Mistake("poses", f"{option}wxyz", "quaternions have w first", first),
+            Mistake("poses", f"{option}xyzw", "quaternions have w last", last),
+            Mistake("poses", "rotations transposed", "rotations are by columns",
+                    _path(_transposed)),
+        ]  # fmt: skip
     table += [
-        Rival("depth", "depth upside down", "depth has its lowest row first", partial(_turned, 1)),
-        Rival("depth", "depth mirrored", "depth has its last column first", partial(_turned, 0)),
-    ]
+        Mistake("depth", "depth upside down", "depth has its lowest row first",
+                partial(_turned, 1)),
+        Mistake("depth", "depth mirrored", "depth has its last column first",
+                partial(_turned, 0)),
+    ]  # fmt: skip
     if by_flow:
         table += [
-            Rival("depth", "depth moved by {px}", "depth isn't registered to the pictures",
-                  _moved_depth, ((0.0, 0.0), (0.06, 0.0), (-0.06, 0.0)), (0.05, 0.0),
-                  in_pixels=True),
-            Rival("depth", "depth of the next frame", "depth is a frame late", _late_depth,
-                  reverses=True, changes_poses=True),
+            Mistake("depth", "depth moved by {px}", "depth isn't registered to the pictures",
+                    _moved_depth, ((0.0, 0.0), (0.06, 0.0), (-0.06, 0.0)), (0.05, 0.0),
+                    in_pixels=True),
+            Mistake("depth", "depth of the next frame", "depth is a frame late", _late_depth,
+                    reverses=True, changes_poses=True),
         ]  # fmt: skip
     if of_flow:
         other = {"backward": "forward", "forward": "backward"}[given["flow_direction"]]
         order = {"uv": "row_column", "row_column": "uv"}[given["flow_channels"]]
         direction, channels = f"flow_direction={other}", f"flow_channels={order}"
         table += [
-            Rival("flow", direction, f"flow points {other}", _gain(-1, 0, 0, -1)),
-            Rival("flow", channels, f"flow's channels are {order}", _gain(0, 1, 1, 0)),
-            Rival("flow", f"{direction} {channels}", f"flow is {other}, {order}",
-                  _gain(0, -1, -1, 0)),
-            Rival("flow", "u negated", "flow's u points left", _gain(-1, 0, 0, 1)),
-            Rival("flow", "v negated", "flow's v points up", _gain(1, 0, 0, -1)),
-            Rival("flow", "flow times the size", "flow is divided by the size",
-                  partial(_in_sizes, 1)),
-            Rival("flow", "flow times half the size", "flow is in half sizes",
-                  partial(_in_sizes, 2)),
-            Rival("flow", "flow divided by {0:.3g}", "flow is of pictures {0:.3g} times as large",
-                  lambda p, n: p._replace(gain=p.gain * n.unsqueeze(-1)),
-                  ((1.0,), (0.4,), (2.5,)), (1.5,)),
-            Rival("flow", "flow_to=next backwards=true", "flow leads to the next frame", _to_next,
-                  changes_poses=True),
-            Rival("flow", "flow on this frame's grid", "flow is on the previous one's",
-                  _of_previous, reverses=True, changes_poses=True),
+            Mistake("flow", direction, f"flow points {other}", _gain(-1, 0, 0, -1)),
+            Mistake("flow", channels, f"flow's channels are {order}", _gain(0, 1, 1, 0)),
+            Mistake("flow", f"{direction} {channels}", f"flow is {other}, {order}",
+                    _gain(0, -1, -1, 0)),
+            Mistake("flow", "u negated", "flow's u points left", _gain(-1, 0, 0, 1)),
+            Mistake("flow", "v negated", "flow's v points up", _gain(1, 0, 0, -1)),
+            Mistake("flow", "flow times the size", "flow is divided by the size",
+                    partial(_in_sizes, 1)),
+            Mistake("flow", "flow times half the size", "flow is in half sizes",
+                    partial(_in_sizes, 2)),
+            Mistake("flow", "flow divided by {0:.3g}", "flow is of pictures {0:.3g} times as large",
+                    lambda p, n: p._replace(gain=p.gain * n.unsqueeze(-1)),
+                    ((1.0,), (0.4,), (2.5,)), (1.5,)),
+            Mistake("flow", "flow_to=next backwards=true", "flow leads to the next frame", _to_next,
+                    changes_poses=True),
+            Mistake("flow", "flow on this frame's grid", "flow is on the previous one's",
+                    _of_previous, reverses=True, changes_poses=True),
         ]  # fmt: skip
     return table
 
@@ -376,7 +382,7 @@ def _late_depth(pairs: Pairs, n: Tensor) -> Pairs:
 
 
 # No mistakes, but what explains data that show nothing of what a mistake needs.
-NO_RIVAL = Rival("poses", "", "", lambda pairs, n: pairs)
-STILL = Rival("poses", "", "", lambda pairs, n: pairs._replace(path=EYE.expand_as(pairs.path)))
-OF_NOISE = Rival("flow", "", "", lambda pairs, n: pairs._replace(gain=1e-3 * pairs.gain))
-FAR = Rival("depth", "", "", _depth(lambda z, n: 1e4 * z))
+NO_MISTAKE = Mistake("poses", "", "", lambda pairs, n: pairs)
+STILL = Mistake("poses", "", "", lambda pairs, n: pairs._replace(path=EYE.expand_as(pairs.path)))
+OF_NOISE = Mistake("flow", "", "", lambda pairs, n: pairs._replace(gain=1e-3 * pairs.gain))
+FAR = Mistake("depth", "", "", _depth(lambda z, n: 1e4 * z))
