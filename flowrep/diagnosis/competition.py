@@ -176,19 +176,31 @@ def _starts(pairs: Pairs, closed: Sequence[Tensor]) -> Tensor:
 
 
 def _shown_by(pairs: Pairs, shown: Mixture, noise: Noise) -> Tensor:
-    """Returns motions that changed pictures show, next to known ones."""
+    """Returns motions that changed pictures show: those next to known ones, and a body's."""
     motion = pairs.motion
     if not pairs.has_poses:
         motion = motion_of_points(*_points(pairs), torch.ones_like(pairs.depth) > 0)
-    return fit.refined(pairs, torch.stack([motion, pictures.best_of(shown)]), noise.px, 4)
+    found = fit.refined(pairs, torch.stack([motion, pictures.best_of(shown)]), noise.px, 4)
+    number = shown.motions[..., 0, 0].isfinite().sum(0)
+    if not pairs.by_flow or (number > 1).double().mean() <= 0.5:
+        return found
+    size = length(residuals(pairs, found)).nan_to_num(math.inf)
+    near = size.nanquantile(0.2, -1, keepdim=True).argmin(0, keepdim=True)
+    left = size.gather(0, near.expand(1, *size.shape[1:]))[0] > 5 * noise.px
+    return torch.cat([found, _of_body(pairs, left, noise)])
 
 
 def _beside_bodies(pairs: Pairs, noise: Noise) -> Mixture:
     """Returns the recorded motions beside others: bodies pull fits of the world to them."""
     motion = torch.where(pairs.motion.isfinite(), pairs.motion, EYE)
     left = length(residuals(pairs, motion)) > 2 * noise.px
-    body = fit.refined(pairs, motion_of_points(*_points(pairs), left).unsqueeze(0), noise.px, 4)
-    return pictures.mixture(pairs, torch.cat([motion.unsqueeze(0), body]), noise)
+    motions = torch.cat([motion.unsqueeze(0), _of_body(pairs, left, noise)])
+    return pictures.mixture(pairs, motions, noise)
+
+
+def _of_body(pairs: Pairs, left: Tensor, noise: Noise) -> Tensor:
+    """Returns a motion `[1, P, 4, 4]` of the pixels that are left."""
+    return fit.refined(pairs, motion_of_points(*_points(pairs), left).unsqueeze(0), noise.px, 4)
 
 
 def _nearest(pairs: Pairs, pool: Tensor) -> Tensor:

@@ -152,6 +152,8 @@ class _Case:
         least_px = max(self.harmless_px, self.bias_px, 2 * self.noise_px * self.pairs.is_estimated)
         if self.is_at_rest:
             least_px = max(least_px, self.rough_px)
+        if self.recorded.poses is not None:  # what pictures don't show is no mistake for certain
+            least_px = max(least_px, self.recorded.systematic_px[1])
         vague_px = max(self.unsure_px, least_px) + self.bias_px
         alike = self._likeliest(least_px, vague_px)
         if not alike:
