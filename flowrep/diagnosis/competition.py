@@ -13,7 +13,7 @@ from flowrep.diagnosis import explanation, fit, pictures, poses
 from flowrep.diagnosis.candidates import Candidate, candidate
 from flowrep.diagnosis.explanation import Explanation
 from flowrep.diagnosis.fit import EYE, Pairs, flow_of, length, median, residuals
-from flowrep.diagnosis.limits import SURE
+from flowrep.diagnosis.limits import REST_PX, SURE
 from flowrep.diagnosis.mistakes import FAR, NO_MISTAKE, OF_NOISE, STILL, Mistake
 from flowrep.diagnosis.pictures import Metric, Mixture, Noise
 from flowrep.geometry.egomotion import motion_of_points
@@ -91,8 +91,14 @@ class Competition:
         return self.is_seen(other) and (null is None or other.nats - null.nats > SURE)
 
     def is_seen(self, other: Explanation) -> bool:
-        """Whether data show what it needs: raw flow beyond noise, or else a camera that moves."""
-        null = self.of_noise if other.mistake.subject == "flow" else self.still
+        """Whether data show what it needs: raw flow beyond noise, or else a camera that moves.
+
+        Beside a camera at rest, flow shows bodies and noise, whatever its conventions.
+        """
+        of_flow = other.mistake.subject == "flow"
+        if of_flow and self._has_poses and self.ego_px <= REST_PX:
+            return False
+        null = self.of_noise if of_flow else self.still
         return null is None or other.nats - null.nats > SURE
 
     def _explained(self, by: Candidate, motions: Tensor) -> Explanation:
