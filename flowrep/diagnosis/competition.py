@@ -146,7 +146,10 @@ def _first_look(pairs: Pairs, mistakes: Sequence[Mistake]) -> tuple[Tensor, Mixt
     starts = _starts(pairs, closed)
     starts = fit.refined(pairs, starts, _noise(pairs, starts).px)
     shown = pictures.mixture(pairs, starts, _noise(pairs, starts))
-    left = _of_likeliest(residuals(pairs, starts), shown, 0.3)
+    # The residuals of each pixel's likeliest motion, unless it is none's.
+    rest, (odds, motion) = residuals(pairs, starts), shown.odds.max(0)
+    own = rest.gather(0, motion[None, :, None].expand(1, -1, rest.shape[2], -1))[0]
+    left = torch.where(odds.unsqueeze(1) > 0.3, own, math.nan)
     return starts, shown, pictures.learnt_noise(pairs, left)
 
 
@@ -220,13 +223,6 @@ def _noise(pairs: Pairs, motions: Tensor) -> Noise:
     rest = residuals(pairs, motions)
     near = length(rest).nanquantile(pictures.near_share(pairs), -1).nan_to_num(math.inf).argmin(0)
     return pictures.learnt_noise(pairs, rest[near, torch.arange(len(near))])
-
-
-def _of_likeliest(maps: Tensor, shown: Mixture, least: float) -> Tensor:
-    """Returns maps `[M, P, C, N]` by each pixel's likeliest motion, nan if its odds are less."""
-    odds, motion = shown.odds.max(0)
-    own = maps.gather(0, motion[None, :, None].expand(1, -1, maps.shape[2], -1))[0]
-    return torch.where(odds.unsqueeze(1) > least, own, math.nan)
 
 
 def _points(pairs: Pairs) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -223,16 +223,14 @@ class _Case:
         if is_clear and deviation_px > max(self.rough_px, least_px, 2 * resolution_px):
             why = f"the recorded motion is {deviation_px:.2g} px from that of the pictures"
             return self._diagnosis("something is wrong", f"{why} ({self.size}), {self.unknown}")
-        # In directions that depth doesn't determine, the nearest motion is as near as it likes.
-        rest = length(residuals(self.pairs, self.pairs.motion))
-        fits = torch.where(
-            rest.isnan(), math.nan, (rest < limits.NOISE * self.found.noise.px).double()
-        )
-        is_lost = fits.nanmean(-1)[is_world] < limits.BODY
-        is_lost &= not self.pairs.by_flow
-        if is_lost.double().mean() > 0.5 and self.left_px > max(self.rough_px, least_px):
-            why = f"hardly a pixel moves as recorded, {self.left_px:.2g} px are left"
-            return self._diagnosis("something is wrong", f"{why} ({self.size}), {self.unknown}")
+        if not self.pairs.by_flow and self.left_px > max(self.rough_px, least_px):
+            # In directions that depth doesn't determine, the nearest motion is as near as it likes.
+            rest = length(residuals(self.pairs, self.pairs.motion))
+            fits = (rest < limits.NOISE * self.found.noise.px).double()
+            share = torch.where(rest.isnan(), math.nan, fits).nanmean(-1)[is_world]
+            if (share < limits.BODY).double().mean() > 0.5:
+                why = f"hardly a pixel moves as recorded, {self.left_px:.2g} px are left"
+                return self._diagnosis("something is wrong", f"{why} ({self.size}), {self.unknown}")
         off_px = poses.y.norm(dim=-1)
         is_bad = poses.is_bad & is_world & (off_px > limits.NOISE * poses.sigma_px)
         is_bad &= off_px > max(limits.NOISE * deviation_px, self.rough_px)
