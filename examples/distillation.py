@@ -24,7 +24,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from tqdm import trange
 
 from flowrep.agent import DiscreteSAC, keep_freed_memory
-from flowrep.agent.observation import store_maps
+from flowrep.agent.map_codec import store_maps
 from flowrep.config.algorithms import DiscreteSACOptions
 from flowrep.envs import StreetEnv, make_env, make_mirror
 from flowrep.envs.street_env import Episode, reward

@@ -18,8 +18,8 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 from flowrep.agent.cuda_graph import as_cuda_graph
 from flowrep.agent.divergence import DivergenceWatch
+from flowrep.agent.map_codec import MapCodec, map_codecs
 from flowrep.agent.networks import MapNetwork, PolicyNetwork, action_count, stochastic_policy
-from flowrep.agent.observation import MapCodec, map_codecs
 from flowrep.agent.precision import compute_dtype
 from flowrep.agent.replay import OUTCOME, ReplayMemory
 from flowrep.config.algorithms import AlgorithmOptions, OffPolicyOptions

@@ -13,8 +13,8 @@ from torchrl.objectives import DiscreteSACLoss, LossModule
 
 from flowrep.agent import networks
 from flowrep.agent.algorithm import OffPolicy, td_target, transition_keys
+from flowrep.agent.map_codec import decode_maps
 from flowrep.agent.networks import Encoder, Head, MapNetwork
-from flowrep.agent.observation import decode_maps
 from flowrep.config.algorithms import AlgorithmOptions, DiscreteSACOptions, SoftActorCriticOptions
 
 METRICS = {

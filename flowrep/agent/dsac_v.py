@@ -13,8 +13,8 @@ from torchrl.objectives import LossModule
 
 from flowrep.agent.algorithm import td_target, transition_keys
 from flowrep.agent.dsac import DiscreteSAC
+from flowrep.agent.map_codec import decode_maps
 from flowrep.agent.networks import MapNetwork
-from flowrep.agent.observation import decode_maps
 from flowrep.config.algorithms import DiscreteSACWithValueOptions
 
 METRICS = {

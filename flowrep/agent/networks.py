@@ -22,7 +22,7 @@ from tensordict.nn import (
 from torch import Tensor, nn
 from torchrl.data import Categorical, TensorSpec
 
-from flowrep.agent.observation import MapCodec
+from flowrep.agent.map_codec import MapCodec
 
 EMBEDDING_SIZE = 512
 

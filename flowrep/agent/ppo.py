@@ -15,8 +15,8 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from flowrep.agent.algorithm import Algorithm
+from flowrep.agent.map_codec import MapCodec, decode_maps, store_maps
 from flowrep.agent.networks import Encoder, Head, MapNetwork, action_count, stochastic_policy
-from flowrep.agent.observation import MapCodec, decode_maps, store_maps
 from flowrep.agent.replay import OUTCOME, time_first
 from flowrep.config.algorithms import PPOOptions
 

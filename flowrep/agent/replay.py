@@ -17,7 +17,7 @@ from torchrl.data import LazyTensorStorage, RoundRobinWriter, Storage, TensorDic
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.envs import Transform
 
-from flowrep.agent.observation import MapCodec, store_maps
+from flowrep.agent.map_codec import MapCodec, store_maps
 
 OUTCOME = ("reward", "done", "terminated")
 
@@ -30,7 +30,7 @@ class ReplayMemory(TensorDictReplayBuffer):
     over those steps), `done` and `terminated`.
 
     Args:
-        codecs: the maps to store; see `flowrep.agent.observation`.
+        codecs: the maps to store; see `flowrep.agent.map_codec`.
         capacity: number of rows; beyond it, the oldest row is overwritten.
         batch_size: number of transitions in a sample.
         device: where rows are stored.

@@ -13,7 +13,7 @@ from flowrep.config.usage import UsageError
 SpeedMode = Literal["low", "normal", "high"]
 """How fast pedestrians walk; each scene has the speeds."""
 FRAME_RATES_HZ = (0.5, 1_000.0)  # lowest and highest
-BaselineName = Literal["planner", "speed_blind", "never_turn", "random"]
+BaselineName = Literal["never_turn", "random", "planner", "speed_blind"]
 
 # Larger whole numbers are not exact as floats.
 Count = Annotated[int, Field(ge=1, le=2**53)]

@@ -8,7 +8,7 @@ import io
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from itertools import cycle, pairwise, product
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import matplotlib as mpl
 import numpy as np
@@ -17,18 +17,15 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from flowrep.config.options import BaselineName
 from flowrep.report.runs import SCENES, Curve, SuccessGrid
 from flowrep.report.statistics import Estimate
 
 _TEXT, _FAINT = "#1b1f24", "#6b7480"
 
 _TITLES = dict(zip(SCENES, ("Straight Road", "S-Turn", "H-Shaped Pathways", "Three-Way Junction")))
-_BASELINE_LINES: dict[str, Any] = {
-    "never_turn": ":",
-    "random": "-.",
-    "planner": "--",
-    "speed_blind": (0, (6, 2, 1, 2)),
-}
+_LINE_STYLES: tuple[Any, ...] = (":", "-.", "--", (0, (6, 2, 1, 2)))
+_BASELINE_LINES = dict(zip(get_args(BaselineName), _LINE_STYLES, strict=True))
 _COLUMN_IN, _PAGE_IN = 3.5, 7.16  # widths of a paper's column and page (IEEE's two columns)
 _MOST_PANELS_IN_A_ROW = 4  # panels
 _WIDEST_BAR = 0.3  # as a share of a group

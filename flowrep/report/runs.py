@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrep.config.options import SpeedMode
+from flowrep.config.options import BaselineName, SpeedMode
 from flowrep.experiment.outcomes import columns_for
 from flowrep.experiment.provenance import flattened, origin_of
 from flowrep.experiment.run import RunFolder, RunFolderError
@@ -32,7 +32,6 @@ COMPLEMENTARY_STACKS = (
     "seg2", "depth2", "ego+obj", "ego+obj+seg2", "ego+obj+depth2", "ego+obj+seg2+depth2",
 )  # fmt: skip
 STACKS = tuple(dict.fromkeys(FLOW_STACKS + COMPLEMENTARY_STACKS))
-DRAWN_BASELINES = ("never_turn", "random", "planner", "speed_blind")
 _REPRESENTATIONS = ("raw", "ego", "obj", "seg", "seg2", "depth", "depth2", "rgb")
 _SHARED_SCENE_KEYS = ("camera", "frame_rate_hz")  # keys whose values are the same in all scenes
 EPISODE_COLUMNS = columns_for("key", "result")
@@ -354,7 +353,7 @@ def grid_of(
     scene: str,
     series: Mapping[str, Sequence[Run]],
     conditions: Sequence[Condition],
-    baselines: Sequence[str] = DRAWN_BASELINES,
+    baselines: Sequence[str] = get_args(BaselineName),
 ) -> SuccessGrid:
     """Returns the success of several series of runs in a scene, without runs of other scenes."""
     here = {name: [run for run in runs if run.scene == scene] for name, runs in series.items()}

@@ -7,7 +7,7 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
 import flowrep.agent
 from flowrep.agent import DiscreteSAC
-from flowrep.agent.observation import store_maps
+from flowrep.agent.map_codec import store_maps
 from flowrep.config import CONF_DIR, group_choices
 
 ALGORITHMS = group_choices("algorithm")

@@ -2,8 +2,8 @@ import pytest
 import torch
 from torchrl.data import Binary, Composite, Unbounded
 
+from flowrep.agent.map_codec import map_codecs
 from flowrep.agent.networks import Encoder
-from flowrep.agent.observation import map_codecs
 
 
 def test_a_normalised_embedding_has_mean_0_and_variance_1_at_any_scale_of_its_map():

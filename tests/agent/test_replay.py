@@ -3,7 +3,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Composite, Unbounded
 
-from flowrep.agent.observation import map_codecs
+from flowrep.agent.map_codec import map_codecs
 from flowrep.agent.replay import ReplayMemory
 from flowrep.transforms import Mirror
 

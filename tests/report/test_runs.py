@@ -1,16 +1,14 @@
 """What a run is, how folders are read, and which runs may be compared: no two configs for one."""
 
 import math
-from typing import get_args
 
 import pytest
 import yaml
 
 pytest.importorskip("scipy", reason="reports are an extra")
 
-from flowrep.config.options import BaselineName
 from flowrep.experiment.run import RunFolderError
-from flowrep.report.runs import DRAWN_BASELINES, groups_of, read_run, read_runs, without_repeats
+from flowrep.report.runs import groups_of, read_run, read_runs, without_repeats
 from tests.report.folders import config_of, letters, rows_of, run_in, write_run
 
 
@@ -73,10 +71,6 @@ def test_a_run_that_is_there_twice_counts_as_one_seed(tmp_path):
 def labels(folder):
     runs, _ = read_runs([folder])
     return {group.label: sorted(r.folder.name for r in group.runs) for group in groups_of(runs)}
-
-
-def test_every_baseline_is_drawn():
-    assert set(DRAWN_BASELINES) == set(get_args(BaselineName))
 
 
 def test_scene_stack_and_seed_of_a_run_come_from_its_config_not_its_folder(tmp_path):

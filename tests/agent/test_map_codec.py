@@ -4,7 +4,7 @@ import pytest
 import torch
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
-from flowrep.agent.observation import map_codecs
+from flowrep.agent.map_codec import map_codecs
 
 
 def codec(spec, key="map", dtype=torch.float32):
