@@ -142,7 +142,7 @@ class _Search:
         self.episode, self.crowd = episode, crowd
         scene = episode.layout.scene
         self.vehicle = scene.vehicle
-        self.person_radius_m = scene.pedestrian_size * PERSON_RADIUS_M
+        self.person_radii_m = scene.pedestrian_sizes * PERSON_RADIUS_M
         self.free, self.way = _ground(episode.layout, episode.path)
 
     def run(self, beam: int, margin_m: float) -> tuple[list[int], bool]:
@@ -203,7 +203,8 @@ class _Search:
         reach = self.vehicle.length_m + self.vehicle.width_m
         low = np.array([state.x_m.min(), state.y_m.min()]) - reach
         high = np.array([state.x_m.max(), state.y_m.max()]) + reach
-        people = people[((people > low) & (people < high)).all(axis=-1)]
+        is_near = ((people > low) & (people < high)).all(axis=-1)
+        people = people[is_near]
         # Distance [V, P] of each person from each footprint, in the vehicles' axes: how far the
         # person is beyond the footprint's front or back, and beyond its sides.
         dx, dy = people[:, 0] - state.x_m[:, None], people[:, 1] - state.y_m[:, None]
@@ -211,4 +212,4 @@ class _Search:
         ahead = np.abs(cosine * dx + sine * dy) - self.vehicle.length_m / 2
         aside = np.abs(cosine * dy - sine * dx) - self.vehicle.width_m / 2
         gap = np.hypot(np.maximum(ahead, 0.0), np.maximum(aside, 0.0))
-        return (gap < self.person_radius_m + margin_m).any(axis=-1)
+        return (gap < self.person_radii_m[is_near] + margin_m).any(axis=-1)

@@ -61,6 +61,7 @@ class Sensing:
             raise ValueError(f"unknown sensors {unknown}; they are: {', '.join(SENSORS)}")
         self.names = tuple(sensors)
         self._street, self._scene = street, street.layout.scene
+        self._sizes = self._scene.pedestrian_sizes
         config = self._scene.camera
         self._size = config.height_px, config.width_px
         self._range_m = config.near_m, config.far_m
@@ -135,7 +136,7 @@ class Sensing:
         )
 
     def _parts(self, poses: Sequence[Array]) -> Array:
-        return world_from_parts(np.stack(poses), self._scene.pedestrian_size)
+        return world_from_parts(np.stack(poses), self._sizes)
 
     def _rasteriser(self, scale: int) -> Any:
         """Returns the rasteriser of pictures of `scale` times the maps' size."""

@@ -136,7 +136,7 @@ def check_path(layout: Layout, path: Path) -> None:
 
 def check_walks(layout: Layout) -> None:
     """Checks that people never overlap a box, another person or the start of the vehicle."""
-    size = layout.scene.pedestrian_size
+    size = layout.scene.largest_size
     reach, least = size * pedestrians.RADIUS_M, size * pedestrians.APART_M
     grounds = {group.name: _ground(layout, group) for group in layout.scene.pedestrian_groups}
     boxes = [*layout.buildings, *layout.obstacles, *layout.closures.values()]
@@ -167,7 +167,7 @@ def check_walks(layout: Layout) -> None:
 
 def _ground(layout: Layout, group: PedestrianGroup) -> list[shapely.Geometry]:
     key, spread = f"pedestrian_groups.{group.name}", group.spread_m
-    size = layout.scene.pedestrian_size
+    size = layout.scene.largest_size
     if spread < (least := pedestrians.least_spread_m(group.count, size)):
         raise SceneError(
             f"{key}.spread_m: is {spread}, but {group.count} people need lanes {least:.2f} m wide "

@@ -25,8 +25,8 @@ _HIP_ASIDE_M = 0.1  # their distance from the middle
 _SIDES = np.array([1.0, -1.0])  # of the legs: left is +y
 
 
-def world_from_parts(poses: Array, size: float) -> Array:
-    """Returns the parts of people at poses [..., P, 4] as transforms [..., 3·P, 4, 4]."""
+def world_from_parts(poses: Array, sizes: Array) -> Array:
+    """Returns the parts of people at poses [..., P, 4], of sizes [P], as [..., 3·P, 4, 4]."""
     x, y, yaw, swing = np.moveaxis(poses, -1, 0)[..., None]
     transforms = np.zeros((*poses.shape[:-1], len(PARTS), 4, 4))
     sine, cosine = np.sin(yaw), np.cos(yaw)
@@ -41,10 +41,10 @@ def world_from_parts(poses: Array, size: float) -> Array:
     transforms[..., 1, 2] = sine * sine_y
     transforms[..., 2, 0] = -sine_y
     transforms[..., 2, 2] = cosine_y
-    aside = size * np.array([0.0, *(_HIP_ASIDE_M * _SIDES)])
+    aside = sizes[:, None] * np.array([0.0, *(_HIP_ASIDE_M * _SIDES)])
     transforms[..., 0, 3] = x - sine * aside
     transforms[..., 1, 3] = y + cosine * aside
-    transforms[..., 1:, 2, 3] = size * HIP_M
+    transforms[..., 1:, 2, 3] = sizes[:, None] * HIP_M
     transforms[..., 3, 3] = 1.0
     return transforms.reshape(*poses.shape[:-2], -1, 4, 4)
 
@@ -186,7 +186,7 @@ def draw_crowd(layout: Layout, speed_mps: Range, rng: np.random.Generator) -> Cr
     """Returns a crowd with phases, directions, speeds and lanes drawn for one episode."""
     lines: list[Array] = []
     speeds, phases = [np.empty(0)], [np.empty(0)]
-    size = layout.scene.pedestrian_size
+    size = layout.scene.largest_size
     for group in layout.scene.pedestrian_groups:
         low, high = group.speed_mps or speed_mps
         draws = 1 if group.draw == "group" else group.count

@@ -51,6 +51,14 @@ def _in_order(bounds: Range) -> Range:
     return bounds
 
 
+def _as_range(sizes: Any) -> Any:
+    return sizes if isinstance(sizes, Sequence) and not isinstance(sizes, str) else (sizes, sizes)
+
+
+def _one_if_equal(sizes: Range) -> float | Range:
+    return sizes[0] if sizes[0] == sizes[1] else sizes
+
+
 def _all_modes(ranges: dict[SpeedMode, Range]) -> dict[SpeedMode, Range]:
     if set(ranges) != set(get_args(SpeedMode)):
         raise ValueError(f"give all of {', '.join(get_args(SpeedMode))}")
@@ -97,10 +105,19 @@ Name = Annotated[str, StringConstraints(min_length=1)]
 FileName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 Point = tuple[Position, Position]
 _Part = TypeVar("_Part")
+_GOLDEN = (math.sqrt(5) - 1) / 2
 MOST_PARTS = 1_000  # of a kind: as many take a second to check
 Parts = Annotated[tuple[_Part, ...], Field(max_length=MOST_PARTS)]
 Size3 = tuple[Length, Length, Length]
 SpeedRange = Annotated[tuple[NotNegative, NotNegative], AfterValidator(_in_order)]
+PersonSize = Annotated[float, Strict(), Field(ge=0.1, le=3.0)]
+SizeRange = tuple[PersonSize, PersonSize]
+SizeOrRange = Annotated[
+    SizeRange,
+    AfterValidator(_in_order),
+    AfterValidator(_one_if_equal),
+    BeforeValidator(_as_range, json_schema_input_type=PersonSize | SizeRange),
+]
 HouseRange = Annotated[tuple[HouseSide, HouseSide], AfterValidator(_in_order)]
 
 
@@ -451,8 +468,9 @@ class Scene(Part):
     paths: Annotated[Parts[Path], Field(min_length=1), AfterValidator(_named_once)]
     pedestrian_speed_mps: Annotated[dict[SpeedMode, SpeedRange], AfterValidator(_all_modes)]
     """[lowest, highest] speed of people in each of the modes low, normal and high."""
-    pedestrian_size: Annotated[float, Strict(), Field(ge=0.1, le=3.0)] = 1.0
-    """Size of people: at 1 they are 1.75 m tall, and 0.6 m wide with swinging arms."""
+    pedestrian_size: SizeOrRange = 1.0  # type: ignore[assignment]  # a single size is kept
+    """Size of people: at 1 they are 1.75 m tall, and 0.6 m wide with swinging arms. With [smallest,
+    largest], each person has a size in between, the same in all episodes."""
     pedestrian_groups: Annotated[Parts[PedestrianGroup], AfterValidator(_named_once)] = ()
     building_rows: Parts[BuildingRow] = ()
     obstacles: tuple[Obstacle, ...] = ()
@@ -476,3 +494,15 @@ class Scene(Part):
     def num_pedestrians(self) -> int:
         """The number of people in the scene."""
         return sum(group.count for group in self.pedestrian_groups)
+
+    @property
+    def pedestrian_sizes(self) -> NDArray[Any]:
+        """The size of each person, `[P]`."""
+        low, high = np.broadcast_to(self.pedestrian_size, 2)
+        # The golden ratio's multiples spread any few successive people over the whole range.
+        return low + (high - low) * (_GOLDEN * np.arange(1, self.num_pedestrians + 1) % 1)
+
+    @property
+    def largest_size(self) -> float:
+        """The largest size of people, which keeps their walks apart."""
+        return float(np.max(self.pedestrian_size))

@@ -59,12 +59,15 @@ class Street:
         self.is_safe = SafeGround(layout)
         self.simulator = Simulator()
         self.bodies: list[Body] = []
-        vehicle, count = layout.scene.vehicle, layout.scene.num_pedestrians
-        size = layout.scene.pedestrian_size
-        radius_m, height_m = size * pedestrians.RADIUS_M, size * pedestrians.HEIGHT_M
+        vehicle, sizes = layout.scene.vehicle, layout.scene.pedestrian_sizes.tolist()
         self._vehicle = self.simulator.add_box(vehicle.length_m, vehicle.width_m, vehicle.height_m)
-        # A single cylinder serves all people: it is placed wherever the vehicle may touch a person.
-        self._person = self.simulator.add_cylinder(radius_m, height_m)
+        # One cylinder serves all people of a size: it is placed where the vehicle may touch one.
+        radius_m, height_m = pedestrians.RADIUS_M, pedestrians.HEIGHT_M
+        cylinders = {
+            size: self.simulator.add_cylinder(size * radius_m, size * height_m)
+            for size in dict.fromkeys(sizes)
+        }
+        self._people = [cylinders[size] for size in sizes]
         self._boxes: list[tuple[Box, int]] = []  # all that can be hit, each with its solid
         self._add_ground(layout)
         self._add_solids([*layout.buildings, *layout.obstacles])
@@ -72,12 +75,12 @@ class Street:
         for name, box in layout.closures.items():
             mesh = meshes.mesh_of(box, both_sides=True)
             self._closures[name] = len(self.bodies), self._add_solid([box], mesh)
-        parts = [mesh for i in range(count) for mesh in person_meshes(i, size)]
+        parts = [mesh for i, size in enumerate(sizes) for mesh in person_meshes(i, size)]
         for instance, mesh in enumerate(parts, start=1):
             self._add_body(mesh, "pedestrian", instance)
         self.triangles = gather(self.bodies)
         reach_m = math.hypot(vehicle.length_m, vehicle.width_m) / 2
-        self._person_reach_m = reach_m + radius_m
+        self._person_reach_m = reach_m + layout.scene.largest_size * radius_m
         self._solids = np.array([solid for _, solid in self._boxes], dtype=int)
         self._category_of = {solid: box.category for box, solid in self._boxes}
         self._centres = np.array([(box.x_m, box.y_m) for box, _ in self._boxes]).reshape(-1, 2)
@@ -113,9 +116,9 @@ class Street:
         simulator, at = self.simulator, state[:2]
         simulator.place(self._vehicle, *state[:3])
         is_near = np.hypot(*(poses[:, :2] - at).T) <= self._person_reach_m
-        for pose in poses[is_near, :3].tolist():
-            simulator.place(self._person, *pose)
-            if simulator.touch(self._vehicle, self._person):
+        for i in np.flatnonzero(is_near).tolist():
+            simulator.place(self._people[i], *poses[i, :3].tolist())
+            if simulator.touch(self._vehicle, self._people[i]):
                 return "pedestrian"
         for name, (_, solid) in self._closures.items():
             simulator.place(solid, 0.0, 0.0, 0.0, 0.0 if name in closures else _HIDDEN_M)

@@ -92,7 +92,7 @@ HIP_M, LEG_M = 0.82, 0.82
 
 
 def test_a_leg_swings_back_while_the_other_swings_forward_and_the_body_only_turns():
-    body, left, right = world_from_parts(POSE, 1.0)
+    body, left, right = world_from_parts(POSE, np.ones(1))
     np.testing.assert_allclose(body @ [1.0, 0.0, 1.2, 1.0], [5.0, 3.0, 1.2, 1.0], atol=1e-12)
     foot = np.array([0.0, 0.0, -LEG_M, 1.0])
     # sin 30° = 0.5: the foot is 0.41 m behind or before the hip and at 0.82·(1 - cos 30°) m.
@@ -108,7 +108,7 @@ def test_people_stand_on_the_ground_and_fill_no_more_than_the_cylinder(swing, si
         [
             mesh.triangles[0].reshape(-1, 3) @ transform[:3, :3].T + transform[:3, 3]
             for mesh, transform in zip(
-                person_meshes(0, size), world_from_parts(poses, size), strict=True
+                person_meshes(0, size), world_from_parts(poses, np.array([size])), strict=True
             )
         ]
     )
@@ -178,6 +178,16 @@ def test_people_of_another_size_keep_apart_by_it():
     assert least_distance(load_scene(large), (1.2, 1.8), episodes=15) >= 0.9
     with pytest.raises(SceneError, match="spread_m"):
         load_scene(replace(large, pedestrian_size=3.0))
+
+
+def test_people_of_various_sizes_keep_apart_as_the_largest():
+    mixed = load_scene(replace(load_scene("s_turn"), pedestrian_size=(0.5, 1.5)))
+    sizes = mixed.pedestrian_sizes
+    assert 0.5 <= sizes.min() < 0.6
+    assert 1.4 < sizes.max() <= 1.5
+    # The first two are 0.618 and 0.236 of the way.
+    np.testing.assert_allclose(sizes[:2], [1.118, 0.736], atol=1e-3)
+    assert least_distance(mixed, (1.2, 1.8), episodes=15) >= 0.9
 
 
 @pytest.mark.parametrize("draw", ["group", "pedestrian"])
