@@ -70,7 +70,12 @@ class RepresentationObservation(gym.Wrapper):
             num_classes = getattr(inner, "num_classes", None)
         is_list = not isinstance(representations, str)  # which the stack refuses by its whole name
         asked = _onehot(representations) if joined and is_list else representations
-        self._stack = representation_stack(asked, intrinsics=intrinsics, num_classes=num_classes)
+        self._stack = representation_stack(
+            asked,
+            intrinsics=intrinsics,
+            num_classes=num_classes,
+            frame_rate_hz=getattr(inner, "frame_rate_hz", None),
+        )
         self._now = TensorDict()
         self.observation_space = self._space(env.observation_space)
 
@@ -272,9 +277,9 @@ def make_streets(
 
 
 def _read_by(representations: Representations) -> list[str]:
-    # K and the number of classes are arbitrary: the sensors that are read don't depend on them.
-    any_camera: dict[str, Any] = {"intrinsics": torch.eye(3), "num_classes": 1}
-    return sensors_read(representation_stack(representations, **any_camera))
+    # Arbitrary: the sensors that are read don't depend on camera, classes and frame rate.
+    any_env: dict[str, Any] = {"intrinsics": torch.eye(3), "num_classes": 1, "frame_rate_hz": 1.0}
+    return sensors_read(representation_stack(representations, **any_env))
 
 
 def _onehot(representations: Representations) -> dict[str, Any]:

@@ -128,7 +128,7 @@ def make_env(
         flow = {"picture_scale": picture_scale, **flow}
         picture_scale = flow["picture_scale"]
     street = partial(StreetEnv, loaded, speed, frame_rate_hz, picture_scale=picture_scale)
-    transforms = Compose()
+    transforms, rate_hz = Compose(), checked_frame_rate(loaded, frame_rate_hz)
     if representations:
         transforms = representation_stack(
             representations,
@@ -138,6 +138,7 @@ def make_env(
             flow=flow,
             motion=motion,
             noise=noise,
+            frame_rate_hz=rate_hz,
         )
     sensors = sensors_read(transforms)
     if keep_sensor:  # rgb and frame only if a transform reads them
@@ -152,7 +153,7 @@ def make_env(
         device=device,
         categorical_action_encoding=True,
     )
-    base.scene, base.frame_rate_hz = loaded, checked_frame_rate(loaded, frame_rate_hz)
+    base.scene, base.frame_rate_hz = loaded, rate_hz
     env = TransformedEnv(base, transforms)
     if seed is not None:
         env.set_seed(seed)

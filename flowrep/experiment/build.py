@@ -110,6 +110,7 @@ def resolved(config: TrainConfig) -> TrainConfig:
             flow=dict(config.flow),
             motion=config.motion,
             noise=config.noise,
+            frame_rate_hz=config.scene.frame_rate_hz,
         )
     except ValueError as error:
         raise UsageError(f"representations, flow or noise: {error}") from error

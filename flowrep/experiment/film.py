@@ -22,6 +22,7 @@ from flowrep.transforms.representations import (
     FLOWS,
     FRAMES_OF,
     REPRESENTATIONS,
+    flow_scale,
     representation_options,
 )
 from flowrep.viz import (
@@ -89,8 +90,11 @@ class Film:
             stack = representation_stack(exact, intrinsics=K, num_classes=num_classes)
             self.env.append_transform(stack)
         self.framed = [name for name in read if name in self.tiles]
+        self._rate_hz = self.env.base_env.frame_rate_hz
         # By tile: the key of its map, and the function that converts the map to the tile's units.
-        self._maps = {name: (name, in_units(name, read.get(name))) for name in self.tiles}
+        self._maps = {
+            name: (name, in_units(name, read.get(name), self._rate_hz)) for name in self.tiles
+        }
         height, width = self.env.observation_spec["seg"].shape[-2:]
         zoom = tile_zoom(height, width)
         self._tile_size = zoom * height, zoom * width
@@ -103,7 +107,7 @@ class Film:
 
         A map of another ratio of height to width gets none, because it doesn't fit the strip.
         """
-        spec, units = self.env.observation_spec[name], in_units(name, options)
+        spec, units = self.env.observation_spec[name], in_units(name, options, self._rate_hz)
         channels, rows, columns = spec.shape[-3:]
         height, width = self._tile_size
         if rows * width != columns * height:
@@ -193,14 +197,17 @@ def known_options(name: str, given: Mapping[str, Any] | None) -> dict[str, Any]:
     return representation_options(name) | dict(given or {}) if name in REPRESENTATIONS else {}
 
 
-def in_units(name: str, given: Mapping[str, Any] | None) -> Units:
+def in_units(name: str, given: Mapping[str, Any] | None, frame_rate_hz: float) -> Units:
     """Returns the function that converts a representation to ids, metres or pixels per step."""
     options = known_options(name, given)
     if "encoding" in options:
         return lambda ids: ids if len(ids) == 1 else ids.argmax(0, keepdim=True).byte()
     if "range_m" in options:  # 1 is the range or beyond it, like the sky
         return lambda depth: torch.where(depth < 1, depth * options["range_m"], torch.inf)
-    return lambda values: values / options["scale"] if name in FLOWS else values
+    if name not in FLOWS:
+        return lambda values: values
+    scale = flow_scale(options, frame_rate_hz)
+    return lambda values: values / scale
 
 
 def _picture_scale(config: EnvConfig) -> int:

@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey
 from torchrl.data import Composite
 from torchrl.envs.transforms import Compose, ExcludeTransform, Transform
 
+from flowrep.geometry.checks import checked_number
 from flowrep.transforms.estimated_flow import EstimatedFlow
 from flowrep.transforms.flow import DEPTH_KEY, RAW_KEYS, FlowFactorize, Intrinsics, RawFlow
 from flowrep.transforms.frame_stack import FrameStack
@@ -58,6 +59,7 @@ def representation_options(name: str) -> Arguments:
     """
     _check_known("representation", [name], REPRESENTATIONS)
     stacked = _defaults(FrameStack, ("k",)) if name in FRAMES_OF else {}
+    stacked |= {"rate_hz": None} if name in FLOWS else {}
     return stacked | _defaults(*_OPTIONS[FRAMES_OF.get(name, name)])
 
 
@@ -76,6 +78,7 @@ def representation_stack(
     flow: str | Mapping[str, Any] = "exact",
     motion: str = "exact",
     noise: Mapping[str, float] | None = None,
+    frame_rate_hz: float | None = None,
 ) -> Compose:
     """Returns the transforms that write the representations at the root of the TensorDict.
 
@@ -108,6 +111,8 @@ def representation_stack(
             `drift_m` and `drift_rad` of `SensorNoise`, 0 by default. Depth, ego and obj are
             computed from the noisy values; raw flow and classes don't use these sensors. The noise
             is a function of the integers under `("sensor", "frame")`, which identify the frame.
+        frame_rate_hz: the env's steps per second. With its option `rate_hz`, a flow is that of
+            1 / `rate_hz` seconds, so that it means the same at any frame rate; else it is a step's.
 
     Raises:
         ValueError: a name, an option or a source is unknown, a value is invalid, or `intrinsics` or
@@ -126,7 +131,11 @@ def representation_stack(
     if num_classes is None and not {"seg", "seg2"}.isdisjoint(chosen):
         raise ValueError("representations seg and seg2 need num_classes=")
     estimator = _estimator_options(flow)
-    flows = {name: chosen[name] for name in FLOWS if name in chosen}
+    flows = {
+        name: chosen[name] | {"scale": flow_scale(chosen[name], frame_rate_hz)}
+        for name in FLOWS
+        if name in chosen
+    }
     if intrinsics is None and flows and (estimator is None or set(flows) != {"raw"}):
         raise ValueError(f"representations {', '.join(FLOWS)} need intrinsics=, the camera's K")
     _check_known("source of motion", [motion], _SOURCES)
@@ -179,6 +188,17 @@ def representation_stack(
     shown = {*named, *_KEPT, *(key for each in foreign.values() for key in each.out_keys)}
     intermediate = [key for key in written if key not in shown]
     return Compose(*transforms, *([DropKeys(*intermediate)] if intermediate else []))
+
+
+def flow_scale(options: Mapping[str, Any], frame_rate_hz: float | None) -> float:
+    """Returns the factor on a flow in pixels per step, given its options and the frame rate."""
+    if options["rate_hz"] is None:
+        return options["scale"]
+    rate_hz, given_hz = (
+        checked_number(name, value, "a positive number", lambda x: x > 0)
+        for name, value in (("rate_hz", options["rate_hz"]), ("frame_rate_hz", frame_rate_hz))
+    )
+    return options["scale"] * given_hz / rate_hz
 
 
 class DropKeys(ExcludeTransform):
@@ -339,7 +359,7 @@ def _estimated_flow(
     first = written
     if "raw" in flows:
         written = {"outputs": ["unscaled", "raw"], "out_keys": [_ESTIMATED_FLOW_KEY, "raw"]}
-        written |= flows["raw"]
+        written["scale"] = flows["raw"]["scale"]
     motion = []
     if estimates_motion:
         motion = [_motion([_ESTIMATED_FLOW_KEY, inputs[1]], camera, _PICTURE_KEY)]

@@ -49,6 +49,21 @@ def in_workers():
     env.close()
 
 
+def test_flow_of_a_time_is_nearly_the_same_at_any_frame_rate(make):
+    # People walk straight on for 1/6 s, so that flow of 1/12 s is half of a step's at 6 Hz, up to
+    # perspective. At 12 Hz the second frame is the first one at 6 Hz.
+    options = {"representations": {"raw": {"rate_hz": 12}}, "seed": 3}
+    slow, fast = make(**options, frame_rate_hz=6.0), make(**options)
+    at_slow = slow.step(slow.reset().set("action", torch.zeros(1).long()))["next", "raw"]
+    td = fast.reset()
+    for _ in range(2):
+        td = fast.step(td.set("action", torch.zeros(1).long()))["next"]
+    apart, length = (at_slow - td["raw"]).norm(dim=1), td["raw"].norm(dim=1)
+    moving = length > 0.5
+    assert moving.sum() > 100
+    assert (apart / length)[moving].median() < 0.15
+
+
 def actions_of(count, num_envs, seed=0):
     generator = torch.Generator().manual_seed(seed)
     return torch.randint(3, (count, num_envs), generator=generator)

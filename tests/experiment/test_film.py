@@ -59,12 +59,13 @@ def test_maps_that_the_agent_does_not_read_are_exact(film_of):
 
 def test_maps_that_the_agent_reads_are_in_units_and_keep_their_noise(film_of):
     options = "representations.obj.scale=0.2", "representations.ego.scale=12.0"
+    options += ("representations.ego.rate_hz=6.0",)  # a step takes half of 1/6 s
     noise = "noise=depth_camera", "noise.depth_dropout=0.2"
     film, seen = film_of("representations=[ego,obj,depth]", *options, *noise), []
     frames, _ = film.drive({"episode_seed": 3}, lambda tensordict: seen.append(tensordict.clone()))
     maps, read = frames[9].maps, seen[9]
     torch.testing.assert_close(maps["obj"], read["obj"][0] * 5.0)
-    torch.testing.assert_close(maps["ego"], read["ego"][0] / 12.0)
+    torch.testing.assert_close(maps["ego"], read["ego"][0] / 24.0)
     torch.testing.assert_close(maps["depth"], (read["depth"][0] * 100.0).where(
         read["depth"][0] < 1, torch.tensor(torch.inf)
     ))  # fmt: skip

@@ -19,8 +19,8 @@ from tests.transforms.test_motion import wide_frames
 stack = functools.partial(representation_stack, intrinsics=INTRINSICS, num_classes=NUM_CLASSES)
 
 
-def rollout(representations) -> torch.Tensor:
-    return TransformedEnv(FakeSensorEnv((2,)), stack(representations)).rollout(5)
+def rollout(representations, **options) -> torch.Tensor:
+    return TransformedEnv(FakeSensorEnv((2,)), stack(representations, **options)).rollout(5)
 
 
 @pytest.mark.parametrize(
@@ -71,6 +71,17 @@ def test_options_reach_the_transforms():
     assert torch.equal(td["depth2"][..., 2:, :, :], plain["depth"])  # its own range, not depth's
     assert td["seg"].shape[-3] == NUM_CLASSES
     assert torch.equal(td["seg2"], plain["seg2"])
+
+
+def test_flow_of_a_time_is_a_share_of_a_steps():
+    # A step takes 1/6 s, twice the twelfth of a second: flow is half as long.
+    asked = {"ego": {"rate_hz": 12}, "raw": {"rate_hz": 12.0, "scale": 3.0}, "obj": None}
+    td = rollout(asked, frame_rate_hz=6.0)
+    plain = rollout(["ego", "raw", "obj"])
+    assert plain["ego"].abs().max() > 0
+    assert torch.allclose(td["ego"], plain["ego"] / 2)
+    assert torch.allclose(td["raw"], 3 * plain["raw"] / 2)
+    assert torch.equal(td["obj"], plain["obj"])
 
 
 def test_a_missing_sensor_is_reported_under_the_name_that_was_asked_for():
