@@ -96,9 +96,10 @@ class Agent(Driver):
             precision: the number format of a trained agent's networks, instead of the run's.
             env: `scene`, a name or a definition, by default that of the training or of conf/ (a
                 trained agent keeps the camera of its training); `device`, by default "auto";
-                `num_envs` side by side; `num_workers`, processes that step them, or "auto". For a
-                policy from another project also `representations`, the names of its maps or a
-                mapping from name to options, and `flow`, `motion` and `noise` as in conf/.
+                `num_envs` side by side; `num_workers`, processes that step them, or "auto". But for
+                a baseline also `noise` as in conf/, and for a policy from another project
+                `representations`, the names of its maps or a mapping from name to options, `flow`
+                and `motion`.
 
         Raises:
             UsageError: there is no such agent.

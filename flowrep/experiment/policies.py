@@ -90,6 +90,7 @@ class NamedBaseline(NamedPolicy):
 class TrainedPolicy(NamedPolicy):
     """An agent that flowrep trained: its camera remains that of the training."""
 
+    takes = (*NamedPolicy.takes, "noise")
     precision: str | None = None
     """The number format of its networks where none is given; None for that of the training."""
 

@@ -255,6 +255,13 @@ def test_a_scene_with_changes_is_driven_with_the_camera_of_training():
     assert agent.config.scene.camera.height_px == 60
 
 
+def test_a_trained_agent_meets_noise_that_its_training_lacked(close_later):
+    agent = Agent.load("pretrained", scene="s_turn", device="cpu", noise={"depth_dropout": 0.3})
+    seen = close_later(agent.make_env(num_envs=1, keep_sensor=True)).reset()
+    assert seen["sensor", "depth"].isnan().sum() == 0
+    assert 0.27 < seen["sensor", "noisy_depth"].isnan().double().mean() < 0.33
+
+
 def test_a_scene_without_a_pretrained_agent_names_those_that_have_one():
     with pytest.raises(UsageError, match="straight_road"):
         Agent.load("pretrained", scene=replace(load_scene("s_turn"), name="my_street"))
