@@ -158,14 +158,27 @@ class PolicyNetwork(nn.Module):
 
     Raw maps are first rounded as in the replay memory, so that the agent sees the same values when
     it acts and when it learns.
+
+    Attributes:
+        mirror: with a `flowrep.transforms.Mirror` of the maps, the output is the mean of log π of
+            the maps and of their mirror image, so that what isn't symmetric in a network's errors
+            cancels.
     """
 
     def __init__(self, network: MapNetwork) -> None:
         super().__init__()
+        self.mirror: Any = None
         self.codecs, self.network = network.codecs, network
 
     def forward(self, *maps: Tensor) -> Tensor:
         """Returns the network's output."""
+        output = self._output(maps)
+        if self.mirror is None:
+            return output
+        image = self._output(self.mirror.images_of(maps))[..., self.mirror.swapped_actions]
+        return (output.log_softmax(-1) + image.log_softmax(-1)) / 2
+
+    def _output(self, maps: Sequence[Tensor]) -> Tensor:
         batch = maps[0].shape[:-3]
         stored = [codec.store(x).reshape(-1, *x.shape[-3:]) for codec, x in zip(self.codecs, maps)]
         outputs = self.network([codec.decode(x) for codec, x in zip(self.codecs, stored)])

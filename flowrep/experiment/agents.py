@@ -73,9 +73,10 @@ class Agent(Driver):
         ):
             run.write_config(config.plain())
             runner.train(stop)
+            driver = runner.driver()
         if stop:
             raise KeyboardInterrupt(f"stopped after {runner.frames} frames; saved in {run.path}")
-        return cls(runner.agent.policy, config, runner.frames, config.scene)
+        return cls(driver.policy, config, runner.frames, config.scene)
 
     @classmethod
     def load(

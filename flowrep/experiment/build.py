@@ -76,6 +76,16 @@ def policy(config: TrainConfig, env: EnvBase) -> Any:
     return maker.make_policy(*specs, options, **run)
 
 
+def evaluated(config: TrainConfig, env: EnvBase, trained: Any) -> Any:
+    """Returns a trained policy as it is evaluated, see `evaluation.mirror`, with its weights."""
+    if not (config.evaluation.mirror and config.scene.symmetric):
+        return trained
+    acting = policy(config, env)
+    acting.load_state_dict(trained.state_dict(), assign=True)  # not a copy
+    acting[0].module.mirror = make_mirror(config.scene, config.representations).to(env.device)
+    return acting
+
+
 def _task(config: TrainConfig, env: EnvBase) -> tuple[Any, tuple[Any, ...], Any, dict[str, Any]]:
     maker, options = algorithm(config.algorithm)
     specs = env.observation_spec, env.action_spec, list(config.representations)

@@ -126,6 +126,7 @@ class TrainedPolicy(NamedPolicy):
             policy = build.policy(config, street)
         try:
             policy.load_state_dict(unpacked(state["policy"]))
+            policy = build.evaluated(config, street, policy)
         except (RuntimeError, TypeError, AttributeError) as error:
             reason = str(error).splitlines()[-1].strip()
             raise CheckpointError(

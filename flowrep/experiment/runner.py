@@ -170,7 +170,7 @@ class Runner:
             evaluation = PairedEvaluation(*episodes, asked.policies, asked.baselines)
         else:
             evaluation = PairedEvaluation([config.speed], [fps], asked.episodes, FIRST_SEEDS[kind])
-        driver = Driver(self.agent.policy, config, self.frames)
+        driver = self.driver()
         # The training's generator stays where it is, so that evaluating more often changes no run.
         with self.clock("evaluation"), torch.random.fork_rng(devices=[]):
             num_envs = max(EVALUATION_ENVS, config.num_envs)
@@ -184,6 +184,11 @@ class Runner:
             print_results([record.row() for record in records])
         return True
 
+    def driver(self) -> Driver:
+        """Returns the agent as it is evaluated."""
+        policy = build.evaluated(self.config, self.env, self.agent.policy)
+        return Driver(policy, self.config, self.frames)
+
     def film(self) -> None:
         """Films an episode if none is filmed."""
         # Drawing takes seconds to import.
@@ -192,8 +197,7 @@ class Runner:
         self.close()  # its worker processes take memory, and so does filming
         path = self.folder.video_path(f"episode_{self.config.speed}")
         if self.config.evaluation.video and not path.is_file():
-            driver = Driver(self.agent.policy, self.config, self.frames)
-            record_episode(driver, path, episode_seed=FIRST_SEEDS["final"])
+            record_episode(self.driver(), path, episode_seed=FIRST_SEEDS["final"])
             print(f"video: {path}")
 
     def close(self) -> None:

@@ -139,6 +139,7 @@ class Evaluation(Options):
     policies: Actings
     baselines: BaselineNames
     video: bool
+    mirror: bool = False
 
     @property
     def final_total(self) -> int:

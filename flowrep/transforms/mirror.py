@@ -111,6 +111,16 @@ class Mirror(Transform):
             return self._mirror(tensordict, chosen)
         return self._mirror(tensordict, torch.ones(shape, dtype=torch.bool, device=device))
 
+    def images_of(self, maps: Sequence[Tensor]) -> list[Tensor]:
+        """Returns the mirror images of maps `[*B, C, H, W]`, one for each of `in_keys`."""
+        everywhere = torch.ones((), dtype=torch.bool, device=maps[0].device)
+        for key, x in zip(self.in_keys, maps):
+            self._check_width(key, x.shape[-1])
+        return [
+            mirror_map(x, everywhere, self.twice_cx, is_flow=key in self.flow_keys)
+            for key, x in zip(self.in_keys, maps)
+        ]
+
     def _mirror(self, tensordict: TensorDictBase, chosen: Tensor) -> TensorDictBase:
         """Replaces the `chosen` `[*B]` transitions by their images."""
         action, swapped = tensordict["action"], self.swapped_actions.to(chosen.device)

@@ -4,6 +4,7 @@ from torchrl.data import Binary, Composite, Unbounded
 
 from flowrep.agent.map_codec import map_codecs
 from flowrep.agent.networks import Encoder
+from flowrep.transforms import Mirror
 
 
 def test_a_normalised_embedding_has_mean_0_and_variance_1_at_any_scale_of_its_map():
@@ -34,6 +35,19 @@ def test_a_batch_acts_like_a_loop_over_it_and_writes_only_the_action(make_any, r
     acted = agent.policy(maps.clone())
     assert acted["action"].shape == batch
     assert set(acted.keys()) - set(maps.keys()) - {"action_log_prob"} == {"action"}
+
+
+def test_a_policy_with_a_mirror_takes_the_mean_of_both_sides(make_agent, random_maps):
+    agent, maps = make_agent(), random_maps(4)
+    image = maps.clone()
+    image["seg"] = maps["seg"].flip(-1)
+    image["flow"] = maps["flow"].flip(-1) * torch.tensor([-1.0, 1.0])[:, None, None]  # u and v
+    here, there = (probabilities(agent, each).log() for each in (maps, image))
+    options = {"flow_keys": "flow", "swapped_actions": [0, 2, 1]}
+    agent.policy[0].module.mirror = Mirror(["flow", "seg"], **options)
+    expected = ((here + there[:, [0, 2, 1]]) / 2).softmax(-1)
+    torch.testing.assert_close(probabilities(agent, maps), expected)
+    assert not torch.allclose(expected, here.exp(), atol=1e-4)
 
 
 def test_an_action_of_several_choices_is_refused(make_agent):

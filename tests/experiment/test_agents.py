@@ -255,6 +255,16 @@ def test_a_scene_with_changes_is_driven_with_the_camera_of_training():
     assert agent.config.scene.camera.height_px == 60
 
 
+def test_an_agent_acts_with_its_mirror_image_if_asked_to_and_where_the_street_is_its_own(tmp_path):
+    config = TINY | {"evaluation": {"every_frames": 0, "mirror": True}, "scene": "straight_road"}
+    agent = Agent.train(folder=tmp_path / "run", **config)
+    agent.save(path := tmp_path / "agent.safetensors")
+    for each in (agent, Agent.load(path), Agent.load(tmp_path / "run")):
+        assert each.policy[0].module.mirror.swapped_actions.tolist() == [0, 2, 1]
+        assert differing(each.policy.state_dict(), agent.policy.state_dict()) == []
+    assert Agent.load(path, scene="s_turn").policy[0].module.mirror is None
+
+
 def test_a_trained_agent_meets_noise_that_its_training_lacked(close_later):
     agent = Agent.load("pretrained", scene="s_turn", device="cpu", noise={"depth_dropout": 0.3})
     seen = close_later(agent.make_env(num_envs=1, keep_sensor=True)).reset()

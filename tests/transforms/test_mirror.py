@@ -66,6 +66,17 @@ def test_any_batch_has_its_image(batch):
     assert same(Compose(mirror())(td.clone()), image(td))
 
 
+def test_images_of_maps_alone_are_those_of_transitions():
+    td = transitions(3)
+    assert all(
+        map(
+            torch.equal,
+            mirror().images_of([td["raw"], td["seg"]]),
+            [image(td)[k] for k in ("raw", "seg")],
+        )
+    )
+
+
 def test_a_replay_buffer_stores_what_was_seen_and_samples_images():
     td = transitions(6)
     td["number"] = torch.arange(6)
