@@ -113,6 +113,7 @@ def representation_stack(
             is a function of the integers under `("sensor", "frame")`, which identify the frame.
         frame_rate_hz: the env's steps per second. With its option `rate_hz`, a flow is that of
             1 / `rate_hz` seconds, so that it means the same at any frame rate; else it is a step's.
+            Episodes that are reset to another rate keep the env's.
 
     Raises:
         ValueError: a name, an option or a source is unknown, a value is invalid, or `intrinsics` or
