@@ -13,6 +13,7 @@ from pydantic import create_model
 from torchrl.envs import EnvBase, InitTracker, Transform
 
 from flowrep.agent import Algorithm
+from flowrep.agent.networks import PolicyNetwork
 from flowrep.agent.precision import resolved_precision
 from flowrep.config.algorithms import ALGORITHMS, AlgorithmOptions
 from flowrep.config.options import FlowOptions, validated
@@ -82,7 +83,10 @@ def evaluated(config: TrainConfig, env: EnvBase, trained: Any) -> Any:
         return trained
     acting = policy(config, env)
     acting.load_state_dict(trained.state_dict(), assign=True)  # not a copy
-    acting[0].module.mirror = make_mirror(config.scene, config.representations).to(env.device)
+    networks = [each for each in acting.modules() if isinstance(each, PolicyNetwork)]
+    if not networks:
+        raise UsageError("evaluation.mirror=true: the algorithm's policy has no PolicyNetwork")
+    networks[0].mirror = make_mirror(config.scene, config.representations).to(env.device)
     return acting
 
 
