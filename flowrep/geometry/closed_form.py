@@ -1,5 +1,7 @@
 """The closed form behind the flow functions, which compiles to a single pass over the pixels.
 
+`numba_flow` computes the same, bit for bit: change both.
+
 With x~ = p - c the pixel relative to the principal point c, K' the intrinsics without it, and
 `prev_from_curr` = (R, T), the point that pixel p shows at depth Z was seen at
 
