@@ -150,3 +150,15 @@ def test_an_env_of_ones_own_is_wrapped_by_its_camera():
         RepresentationObservation(Wall(), ["ego"])
     with pytest.raises(ValueError, match=r"list of names.*'ego'"):
         RepresentationObservation(Wall(), "ego", intrinsics=K)
+
+
+def test_flow_of_a_time_needs_no_frame_rate_but_the_env_s():
+    of_step, of_time = (
+        gymnasium.make(ID, representations={"ego": {"rate_hz": rate}}, joined=False)
+        for rate in (None, 6.0)
+    )
+    for env in (of_step, of_time):
+        env.reset(seed=0)
+    step, time = (env.step(0)[0]["ego"] for env in (of_step, of_time))
+    assert np.abs(step).max() > 1.0
+    np.testing.assert_allclose(time, 2 * step, rtol=1e-6)  # 1/6 s is two steps of 1/12 s

@@ -139,6 +139,19 @@ def test_no_frame_rate_lets_the_vehicle_pass_through_a_person(
     assert sum(rewards) == pytest.approx(-5.0 + 0.01 * len(rewards))
 
 
+def test_each_person_is_hit_by_their_own_size(make_street, one_stands):
+    (person,) = one_stands.pedestrian_groups
+    behind = replace(
+        person, name="behind", walk=replace(person.walk, points_m=((60.0, 0), (60.0, 1)))
+    )
+    scene = replace(one_stands, pedestrian_groups=(behind, person), pedestrian_size=(0.2, 3.0))
+    env = make_street(scene, sensors=())
+    drive(env)
+    # The first has 1.93; the second, 0.2 + 0.236 · 2.8 = 0.86: a radius of 0.26 m, at 29.24,
+    # after 70 looks at 29.17. One of 1.93 would be at 28.92.
+    assert env.episode.now.ticks == 71
+
+
 def test_no_speed_lets_the_vehicle_pass_through_a_fence_or_a_person(
     make_street, empty_road, one_stands
 ):
