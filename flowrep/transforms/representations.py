@@ -199,7 +199,8 @@ def flow_scale(options: Mapping[str, Any], frame_rate_hz: float | None) -> float
         checked_number(name, value, "a positive number", lambda x: x > 0)
         for name, value in (("rate_hz", options["rate_hz"]), ("frame_rate_hz", frame_rate_hz))
     )
-    return options["scale"] * given_hz / rate_hz
+    scale = checked_number("scale", options["scale"], "a finite number", lambda x: True)
+    return scale * given_hz / rate_hz
 
 
 class DropKeys(ExcludeTransform):

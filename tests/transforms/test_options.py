@@ -78,6 +78,9 @@ MISTAKES = {
         ["raw"], noise={"drift_m": -0.1}
     ),
     r"rate_hz must be a positive.*'12'": lambda: stack({"ego": {"rate_hz": "12"}}, frame_rate_hz=6),
+    r"scale must be a finite.*'2'": lambda: stack(
+        {"ego": {"rate_hz": 12, "scale": "2"}}, frame_rate_hz=6
+    ),
     r"frame_rate_hz must be.*None": lambda: stack({"ego": {"rate_hz": 12}}),
     r"need num_classes=": lambda: T.representation_stack(["seg2"]),
     r"need intrinsics=": lambda: T.representation_stack(["depth", "ego"], num_classes=3),
