@@ -126,14 +126,14 @@ class TrainedPolicy(NamedPolicy):
             policy = build.policy(config, street)
         try:
             policy.load_state_dict(unpacked(state["policy"]))
-            policy = build.evaluated(config, street, policy)
         except (RuntimeError, TypeError, AttributeError) as error:
             reason = str(error).splitlines()[-1].strip()
             raise CheckpointError(
                 f"the agent in {path} can't be used in scene '{config.scene.name}': the file is "
                 f"damaged, or its maps have another size there ({reason})"
             ) from error
-        return policy, config, state["frames"], trained.scene
+        acting = build.evaluated(config, street, policy)
+        return acting, config, state["frames"], trained.scene
 
     def stored(self, scene: Scene | None, trusted: Collection[str]) -> Stored:
         """Returns the config of its training, the state with `frames` and `policy`, their file."""
