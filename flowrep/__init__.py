@@ -1,6 +1,7 @@
 """Factorized optical flow (ego + object) as mid-level representations for visual RL."""
 
 import warnings
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -19,14 +20,11 @@ else:
     )
 
 
+_LATER = {"Agent": "flowrep.experiment.agents", "diagnose": "flowrep.diagnosis"}
+
+
 def __getattr__(name: str) -> Any:
     """Imports `diagnose` and `Agent`, and with them PyTorch, when they are first used."""
-    if name == "diagnose":
-        from flowrep.diagnosis import diagnose
-
-        return diagnose
-    if name == "Agent":
-        from flowrep.experiment.agents import Agent
-
-        return Agent
+    if name in _LATER:
+        return getattr(import_module(_LATER[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
