@@ -144,7 +144,7 @@ def announce(config: TrainConfig, settings: str) -> None:
     )
     if settings == "preset=paper" and device.type == "cpu" and config.total_frames >= 1_000_000:
         print(
-            f"{config.total_frames:,} frames with the paper's settings take half a day or more; "
+            f"{config.total_frames:,} frames with the paper's settings take about a day a map; "
             "preset=laptop takes minutes"
         )
 
