@@ -317,7 +317,7 @@ def _spec(box: Any) -> Bounded | Unbounded:
 
 
 def _box(spec: Bounded | Categorical | Unbounded) -> spaces.Box:
-    dtype = np.uint8 if spec.dtype == torch.uint8 else np.float32
+    dtype = torch.empty(0, dtype=spec.dtype).numpy().dtype
     if isinstance(spec, Categorical):
         return spaces.Box(0, spec.n - 1, tuple(spec.shape), dtype)
     if isinstance(spec, Bounded):

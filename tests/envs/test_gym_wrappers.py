@@ -124,6 +124,27 @@ class Wall(gymnasium.Env):
         return self.look(0.1), 0.0, False, False, {}
 
 
+class WallInDoublePrecision(Wall):
+    observation_space = spaces.Dict(
+        Wall.observation_space.spaces | {"depth": spaces.Box(0, np.inf, (1, 3, 5), np.float64)}
+    )
+
+    def look(self, x_m):
+        seen = super().look(x_m)
+        return seen | {"depth": seen["depth"].astype(np.float64)}
+
+
+def test_spaces_have_the_maps_types():
+    K = [[40.0, 0.0, 2.5], [0.0, 50.0, 1.5], [0.0, 0.0, 1.0]]
+    for joined, dtype in ((False, np.float64), (True, np.float32)):
+        env = RepresentationObservation(
+            WallInDoublePrecision(), ["ego"], intrinsics=K, joined=joined
+        )
+        observation, _ = env.reset(seed=0)
+        assert observation in env.observation_space
+        assert (observation if joined else observation["ego"]).dtype == dtype
+
+
 def test_an_env_of_ones_own_is_wrapped_by_its_camera():
     K = [[40.0, 0.0, 2.5], [0.0, 50.0, 1.5], [0.0, 0.0, 1.0]]
     env = RepresentationObservation(Wall(), ["ego", "depth"], intrinsics=K)
