@@ -214,15 +214,14 @@ class MapTransform(Transform):
             self._check_values(tensordict_reset, waits=begins is None)
             return self._call(tensordict_reset)
         # TorchRL keeps only the rows that are reset. Computing the others, too, would be slow for
-        # estimated flow.
+        # estimated flow: they get a copy of one that is reset.
         reset = tensordict_reset[rows]
         self._check_values(reset)
         reset = self._call(reset)
+        at = (rows.flatten().cumsum(0) - 1).clamp(min=0).reshape(rows.shape)
         for key in self.out_keys:
             if (value := reset.get(key, None)) is not None:
-                whole = value.new_zeros((*rows.shape, *value.shape[1:]))
-                whole[rows] = value
-                tensordict_reset.set(key, whole)
+                tensordict_reset.set(key, value[at])
         return tensordict_reset
 
     @dispatch(source="in_keys", dest="out_keys", auto_batch_size=False)

@@ -463,7 +463,7 @@ def _highest_id(ids: TensorSpec) -> int | None:
         return int(ids.n) - 1
     if not isinstance(ids, Bounded):
         return None
-    highest = int(ids.space.high.max())
+    highest = int(ids.space.high.cpu().numpy().max())  # PyTorch has no maximum of uint16
     return None if highest == torch.iinfo(ids.dtype).max else highest
 
 

@@ -121,6 +121,15 @@ def test_a_transform_that_changes_a_carried_stack_is_refused(later, said):
     torch.testing.assert_close(seen["normal"], 0.1 * seen[STACK], equal_nan=True)
 
 
+def test_wide_unsigned_maps_are_stacked_where_envs_end_at_different_times():
+    wide = DTypeCastTransform(torch.uint8, torch.uint16, [("sensor", "rgb")], ["wide"])
+    stacks = FrameStack(in_keys=["wide", ("sensor", "rgb")], out_keys=["wide2", "rgb2"])
+    env = TransformedEnv(FakeSensorEnv((2,)), Compose(wide, stacks))
+    td = env.rollout(5, break_when_any_done=False)
+    assert td["wide2"].dtype == torch.uint16
+    assert td["wide2"].to(torch.uint8).equal(td["rgb2"])
+
+
 def test_a_policy_that_converts_the_stack_is_refused():
     def policy(td):
         td[STACK] = td[STACK].double()

@@ -118,7 +118,8 @@ def test_no_body_gets_its_neighbours_motion():
         return TransformedEnv(WithRows(**options), stack).rollout(1)["next", "raw"]
 
     shape = (1, 5, 7)
-    assert flow(ids=Bounded(0, 2, shape, dtype=torch.uint8)).isfinite().all()
+    for dtype in (torch.uint8, torch.uint16):
+        assert flow(ids=Bounded(0, 2, shape, dtype=dtype)).isfinite().all()
     with pytest.raises(ValueError, match=r"ids from 0 to 2.*4 rows.*1 \+ N.*bodies alone"):
         flow(static_row=True)
     for ids in (Unbounded(shape, dtype=torch.uint8), Bounded(0, 255, shape, dtype=torch.uint8)):
