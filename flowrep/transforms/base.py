@@ -328,8 +328,7 @@ class RecurrentTransform(MapTransform):
             for key, then, value in zip(self.in_keys, before, now):
                 check_unconverted(key, then, value)
         outputs = self.advance(before, now)
-        env = self.parent
-        if env is not None and env.__dict__.get("_torchrl_native_autoreset", False):
+        if _outermost(self).__dict__.get("_torchrl_native_autoreset", False):
             # Such an env returns the first frame of the next episode with the last step of this
             # one, and the transforms that follow have to see what is computed from it.
             done = flags_of_batch(next_tensordict.get("done"), next_tensordict)
@@ -434,11 +433,15 @@ class RecurrentTransform(MapTransform):
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         """Returns the input specs of `step`, including the `carried_keys`."""
         input_spec = super().transform_input_spec(input_spec)
-        if self.parent is None:
+        env = _outermost(self)
+        if not isinstance(env, EnvBase):
             return input_spec
-        observation_spec = self.transform_observation_spec(self.parent.observation_spec)
+        # Not `parent`, with which TorchRL fails in a Compose that begins another Compose.
+        output_spec, beside = env.base_env.output_spec.clone(), self._beside()
+        for transform in beside[: beside.index(self) + 1]:
+            output_spec = transform.transform_output_spec(output_spec)
         for key in self.carried_keys:
-            state, spec = input_spec["full_state_spec"], observation_spec
+            state, spec = input_spec["full_state_spec"], output_spec["full_observation_spec"]
             *groups, name = (key,) if isinstance(key, str) else key
             for group in groups:  # of several agents, say, with a batch size of its own
                 spec = spec[group]

@@ -281,7 +281,8 @@ def test_envs_that_reset_themselves_give_the_same_first_frames():
             T.EstimatedFlow(brightening),
             DropKeys("motion"),
         )
-        return TransformedEnv(env, stack).rollout(9, break_when_any_done=False)
+        # A Compose in a Compose, as `representation_stack` in a stack of one's own.
+        return TransformedEnv(env, Compose(stack)).rollout(9, break_when_any_done=False)
 
     own, reset = rollout(SelfResettingEnv((2,))), rollout(FakeSensorEnv((2,)))
     for key in (depth, "ego", "rgb2", "raw"):
