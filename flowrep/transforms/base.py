@@ -441,6 +441,12 @@ class RecurrentTransform(MapTransform):
         for transform in beside[: beside.index(self) + 1]:
             output_spec = transform.transform_output_spec(output_spec)
         for key in self.carried_keys:
+            # TorchRL's rollouts would keep the first frame's value for the whole episode.
+            if key not in env.observation_spec.keys(True):
+                raise ValueError(
+                    f"a later transform drops {key!r}, which {type(self).__name__} reads again at "
+                    "the next step: let it keep this key"
+                )
             state, spec = input_spec["full_state_spec"], output_spec["full_observation_spec"]
             *groups, name = (key,) if isinstance(key, str) else key
             for group in groups:  # of several agents, say, with a batch size of its own

@@ -49,7 +49,7 @@ class FrameStack(RecurrentTransform):
 
     Raises:
         ValueError: `k` is less than 1, a stack has the key of a map, or a later transform of the
-            same `TransformedEnv` changes a stack.
+            same `TransformedEnv` changes or drops a stack.
         MissingKey: in calls, the previous step or the trajectory is missing.
 
     Example:

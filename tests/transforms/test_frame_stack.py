@@ -18,7 +18,13 @@ from torchrl.data import (
     Unbounded,
 )
 from torchrl.envs import TransformedEnv
-from torchrl.envs.transforms import Compose, DTypeCastTransform, MultiStepTransform, ObservationNorm
+from torchrl.envs.transforms import (
+    Compose,
+    DTypeCastTransform,
+    MultiStepTransform,
+    ObservationNorm,
+    SelectTransform,
+)
 
 from flowrep.transforms import Depth, FrameStack, Segmentation
 from tests.transforms.fake_env import NUM_CLASSES, FakeSensorEnv, moment
@@ -109,6 +115,7 @@ def normalised(key):
         (lambda: normalised(STACK), f"ObservationNorm writes to '{STACK}'"),
         (lambda: Compose(Depth(), normalised(STACK)), f"ObservationNorm writes to '{STACK}'"),
         (lambda: DTypeCastTransform(torch.float32, torch.float64, [STACK]), "writes to"),
+        (lambda: SelectTransform(KEY), f"drops '{STACK}'"),  # each step would read the first frame
     ],
 )
 def test_a_transform_that_changes_a_carried_stack_is_refused(later, said):
