@@ -31,7 +31,8 @@ class FrameStack(RecurrentTransform):
     `StepCounter` does. No state is kept between calls, so stacks can't mix episodes or envs.
     (TorchRL's `CatFrames` keeps state. In a replay buffer it stacks neighbours of a sample, which
     is wrong for shuffled samples.) What converts a stack afterwards, such as TorchRL's
-    `ObservationNorm`, has to write to another key, since the next step reads the stack again.
+    `ObservationNorm`, has to write to another key, since the next step reads the stack again. A
+    `SelectTransform` around a batch of envs has to name the stack, or rollouts keep its first one.
 
     In a replay buffer, the stack stored at the root and the next frame give the next stack exactly,
     in shuffled samples too. Without `("next", out_key)`, a transition takes k + 1 frames instead of
