@@ -139,6 +139,7 @@ class RepresentationVectorObservation(gym.vector.VectorWrapper):
         self._one = RepresentationObservation(env.envs[0], representations, joined=joined)
         self.single_observation_space = self._one.observation_space
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
+        self.autoreset_mode = env.autoreset_mode  # TorchRL's GymWrapper reads it
         self._truncate_timeouts = truncate_timeouts
         self._ended = np.zeros(env.num_envs, dtype=bool)
         self._now = TensorDict()
@@ -171,7 +172,7 @@ class RepresentationVectorObservation(gym.vector.VectorWrapper):
     ) -> Maps:
         """Returns the maps of streets that have begun an episode, and of others after a step."""
         sensed, rows = _sensed(sensors, [self.num_envs]), torch.as_tensor(begun)
-        if rows.all():
+        if rows.all() or self._now.is_empty():  # without an episode, sensors are 0
             self._now = self._one._stack._reset(sensed, sensed)
         else:
             self._now = self._one._stack._step(self._now, sensed) if others is None else others

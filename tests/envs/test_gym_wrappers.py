@@ -89,7 +89,9 @@ def test_streets_of_make_vec_are_single_streets_side_by_side(joined):
     ours = gymnasium.make_vec(ID, num_envs=3, **options)
     theirs = gymnasium.make_vec(ID, num_envs=3, vectorization_mode="sync", **options)
     assert ours.observation_space == theirs.observation_space
-    assert ours.metadata["autoreset_mode"] == theirs.metadata["autoreset_mode"]
+    assert ours.metadata["autoreset_mode"] == ours.autoreset_mode == theirs.autoreset_mode
+    first, _ = ours.reset(options={"reset_mask": np.array([True, False, False])})
+    assert first in ours.observation_space
     assert differing(ours.reset(seed=4), theirs.reset(seed=4)) == []
     count = 0
     for _ in range(25):  # the first one turns off the road; the step after that begins anew
