@@ -50,8 +50,9 @@ def candidate(pairs: Pairs, mistake: Mistake, motion: Tensor, noise: Tensor) -> 
 
     def cost(n: Tensor) -> float:
         squared = (residuals_of(n.unsqueeze(0)) / noise.unsqueeze(1)).square().sum(2)
-        # Depth that is looked up elsewhere is unknown at some pixels: they count as others do.
-        return float(squared.log1p().nanmean(-1).nan_to_num(math.inf).mean())
+        # Depth that is looked up elsewhere, or the next pose, is unknown at some pixels or pairs:
+        # they count as others do.
+        return float(squared.log1p().nanmean(-1).nanmean().nan_to_num(math.inf))
 
     starts = [noise.new_tensor(start).expand(count, k) for start in mistake.start]
     if not k:
