@@ -118,7 +118,7 @@ def tested(reasons: Sequence[str]) -> list[int]:
     """Returns the pairs to test: those that move, and those at rest if few do."""
     moving = [i for i, why in enumerate(reasons) if not why]
     known = [i for i, why in enumerate(reasons) if why in ("", _STILL)]
-    return moving if len(moving) > FEW else known
+    return moving if len(moving) >= FEW else known
 
 
 def note_on_untested(reasons: Sequence[str]) -> list[str]:
