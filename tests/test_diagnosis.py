@@ -225,10 +225,11 @@ def test_a_constant_K_that_is_wrong_is_no_K_that_changes():
 
 def test_a_camera_that_is_turned_half_around_on_its_mount_is_named():
     right, turn = drawn(ROOM), np.eye(4)
-    angle = np.radians(165)
+    angle = np.radians(195)
     turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     found = examined(right.with_(poses=right.poses @ turn))
     assert any(name.startswith("marker_from_cam=[") for name in found.suspects), found
+    assert "165.0 degrees" in found.words
 
 
 def test_a_direction_that_depth_hardly_shows_is_no_right_motion():
@@ -270,6 +271,13 @@ def test_a_frame_without_a_pose_does_not_hide_that_the_others_are_wrong():
     assert found.diagnosis().suspects == ("pose_axes=opengl",)
 
 
+def test_three_pairs_that_move_are_not_outvoted_by_those_at_rest():
+    frames, found = frames_of(with_mistake("poses OpenGL"))[:4], Examination()
+    for previous, current in [*pairwise(frames), *[(frames[1], frames[1])] * 9]:
+        found.add(previous, current, current.raw * (previous is not current))
+    assert found.diagnosis().suspects == ("pose_axes=opengl",)
+
+
 def test_what_hardly_moves_or_is_hardly_known_tells_nothing():
     right = drawn(ROOM)
     still = examined(right.with_(flow=0 * right.flow, poses=right.poses[[0] * 10],
@@ -277,6 +285,8 @@ def test_what_hardly_moves_or_is_hardly_known_tells_nothing():
     assert still.is_right  # there is no flow that could be wrong
     assert "9 of 9 pairs tell little: hardly anything moves" in still.notes
     assert any("no convention is tested" in note for note in still.notes)
+    assert "poses ... frames later" in still.unseen
+    assert len(set(still.unseen)) == len(still.unseen)
     unknown = right.depth.copy()
     unknown[:, 1:] = np.nan
     unknown[:, 0, 40:] = np.nan
@@ -330,7 +340,7 @@ def test_rows_and_ids_that_do_not_fit_the_bodies_are_told(frames):
 def test_motions_of_bodies_that_leave_their_pixels_are_told(seed):
     kind, found, _ = outcome(drawn(seed), *mistaken(drawn(seed), seed))
     assert kind == "noticed"
-    assert found.words.startswith("instance_motion or ids don't fit the bodies")
+    assert found.words.startswith("on bodies, ids, instance_motion, depth and K don't fit")
 
 
 def test_half_a_picture_of_sky_is_no_noise_of_depth():

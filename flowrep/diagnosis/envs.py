@@ -242,7 +242,7 @@ def _bodies(seen: _Seen, world_px: float) -> tuple[str, str]:
     world's residual `world_px`, of the camera's poses, is no fault of a body's.
     """
     count, ids = seen.rows.shape[1], seen.ids[:, 0]
-    unseen = "no moving body is seen: ids and motions of bodies are not tested"
+    unseen = "moving bodies are hardly seen: their ids and motions are not tested"
     if not seen.has_rows:
         return "untested", unseen
     if int(ids.min()) < 0 or int(ids.max()) >= count:
@@ -285,7 +285,7 @@ def _bodies(seen: _Seen, world_px: float) -> tuple[str, str]:
     px, share = limits.HARMLESS
     if found.is_wrong and found.left_px > world_px + px + share * found.raw_px:
         left = f"{found.left_px:.2g} px are left, {found.best_px:.2g} px by other motions"
-        return "fault", f"instance_motion or ids don't fit the bodies: {left}"
+        return "fault", f"on bodies, ids, instance_motion, depth and K don't fit: {left}"
     if not found.is_right:
         return "untested", f"motions of bodies are not tested: {found.words}"
     return "", ""

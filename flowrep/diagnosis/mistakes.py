@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import product
@@ -66,7 +67,7 @@ class Mistake(NamedTuple):
     @property
     def name(self) -> str:
         """The remedy without numbers."""
-        return self.remedy.partition("={")[0].partition("=[")[0].partition(" {")[0]
+        return re.sub("{.*?}", "...", self.remedy)
 
     def texts(self, numbers: Tensor, width: int) -> tuple[str, str]:
         """Returns the remedy and the description, with the numbers that were fitted."""
@@ -77,9 +78,9 @@ class Mistake(NamedTuple):
         if len(numbers) >= 2:  # the last two of some are shares of the width
             values["px"] = f"({width * n[-4]:+.1f}, {width * n[-3]:+.1f}) px"
         if len(numbers) in (3, 6):
-            values["degrees"] = f"{math.degrees(math.hypot(*n[:3])):.1f}"
-            rows = small_motion(torch.cat([numbers, 0 * numbers])[:6])[:3].flatten().tolist()
-            values["matrix"] = f"[{','.join(f'{x:.4g}' for x in rows)}]"
+            turned = small_motion(torch.cat([numbers, 0 * numbers])[:6])
+            values["degrees"] = f"{math.degrees(motion_vector(turned)[:3].norm()):.1f}"
+            values["matrix"] = f"[{','.join(f'{x:.4g}' for x in turned[:3].flatten().tolist())}]"
         return self.remedy.format(*n, **values), self.description.format(*n, **values)
 
 

@@ -299,4 +299,4 @@ def _unseen(pairs: Pairs, mistakes: Sequence[Mistake], least: float) -> tuple[st
             apart = length(residuals(other, other.motion) - now)
             if median(apart.nanmedian(-1).values) <= least:
                 unseen.append(mistake.name)
-    return tuple(unseen)
+    return tuple(dict.fromkeys(unseen))
