@@ -138,7 +138,7 @@ def test_most_poses_that_do_not_fit_estimated_flow_are_not_called_right():
         ("depth in mm", NOISY), ("flow backward", ROOM), ("K of another size", ROOM),
         ("poses NED", STREET_ENV), ("depth in mm", STREET_ENV),
         ("depth upside down", 70156),  # where it was turned back, a third of it is unknown
-        ("flow to the next frame", NOISY),  # the last frame has no next one
+        ("flow to the next frame", ROOM),  # the last frame has no next one
     ],
 )  # fmt: skip
 def test_a_listed_mistake_is_named(name, seed):

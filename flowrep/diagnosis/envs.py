@@ -194,7 +194,7 @@ class _Seen:
             expected = torch.where(self.flow.valid, self.flow.flow, math.nan)
             apart, size = (length(x.flatten(2)) for x in (self.raw - expected, expected))
             differs = (apart > _rounded_px(size))[apart.isfinite()]
-            self.is_derived = not differs.double().mean() > 0.5
+            self.is_derived = not differs.double().mean() > limits.MANY
 
     def flow_of(self, motion: Tensor) -> geometry.Flow:
         """Returns the flow of a static world."""

@@ -46,7 +46,7 @@ class Mistake(NamedTuple):
             fit. Interpolated depth has less noise, for which alone the mistake would win.
         is_vague: whether it stands for many mistakes, and names none.
         of_time: whether it interpolates between poses.
-        reverses: whether it looks at pairs of frames from the earlier one.
+        reverses: whether it looks at pairs of frames from the earlier one, or backwards.
         changes_poses: whether it changes poses beside its subject.
     """
 
@@ -209,7 +209,7 @@ def mistakes_of(
                     lambda p, n: p._replace(gain=p.gain * n.unsqueeze(-1)),
                     ((1.0,), (0.4,), (2.5,)), (1.5,)),
             Mistake("flow", "flow_to=next backwards=true", "flow leads to the next frame", _to_next,
-                    changes_poses=True),
+                    reverses=True, changes_poses=True),
             Mistake("flow", "flow on this frame's grid", "flow is on the previous one's",
                     _of_previous, reverses=True, changes_poses=True),
         ]  # fmt: skip
