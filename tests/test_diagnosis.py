@@ -392,6 +392,11 @@ def test_flow_that_was_measured_is_a_reference_of_its_own(frames):
     found = spoilt(frames, raw=lambda flow: -flow)
     assert "flow_direction=backward" in found.suspects
     assert "AdaptFlow" in found.words
+    td, K = frames
+    td = td.exclude("obj").clone()
+    td["raw"] += 3.0 * (torch.arange(td["raw"].shape[-1]) % 3 == 0)
+    # although most pixels have the flow of depth and poses
+    assert diagnose(td, K).words.startswith("raw flow")
 
 
 @pytest.mark.parametrize(
