@@ -111,7 +111,11 @@ class BulletCamera:
     ) -> None:
         if not 1 <= max_instances < 1 << 15:
             raise ValueError(f"max_instances must be 1 to {(1 << 15) - 1}, got {max_instances}")
-        self._client = _Client(client) if isinstance(client, int) else client
+        if taken := {"physicsClientId", "projectionMatrix", "viewMatrix"} & picture.keys():
+            raise ValueError(f"give client, projection or view instead of {', '.join(taken)}")
+        if picture.get("flags", 0) & pybullet.ER_NO_SEGMENTATION_MASK:
+            raise ValueError("without a segmentation mask (ER_NO_SEGMENTATION_MASK), no instances")
+        self._client = _Client(int(client)) if isinstance(client, int | np.integer) else client
         self.width, self.height = width, height
         if projection is None:
             near_m, far_m = 0.05 if near_m is None else near_m, 100.0 if far_m is None else far_m
@@ -124,7 +128,8 @@ class BulletCamera:
         elif (fov_deg, near_m, far_m) != (None, None, None):
             raise ValueError("give projection, or fov_deg, near_m and far_m; not both")
         self._picture = {"shadow": 0, "renderer": renderer} | picture
-        self._picture["projectionMatrix"] = list(projection)
+        # PyBullet ignores matrices that aren't flat lists, and draws with the last ones.
+        self._picture["projectionMatrix"] = np.ravel(projection).tolist()
         flags = pybullet.ER_SEGMENTATION_MASK_OBJECT_AND_LINKINDEX
         self._picture["flags"] = self._picture.get("flags", 0) | flags
         self.K, self._range_m = self._intrinsics(np.array(projection, dtype=np.float32))
@@ -244,6 +249,8 @@ class BulletCamera:
         for tag, each in bodies.items():
             if each.number == body and -1 <= link < len(each.parents):
                 world_from_link = poses[tag][1 + link] @ each.mass_from_link[1 + link]
+                if np.isnan(world_from_link).any():
+                    raise ValueError(f"link {link} of body {body} has no known pose for a camera")
                 return world_from_link if view is None else world_from_link @ _pose_of_view(view)
         raise ValueError(
             f"no body {body} with a link {link}; there are "
@@ -275,7 +282,7 @@ class BulletCamera:
             unknown = sorted({int(number) for number in body[instance < 0]})
             raise RuntimeError(
                 f"the picture shows bodies {unknown}, or links of them, that this client doesn't "
-                "list: another process added them; call its syncBodyInfo()"
+                "list: another process or batchPositions added them; call its syncBodyInfo()"
             )
         maps = {"depth": depth[None], "instance": instance[None].astype(self._instance_type)}
         if self._classes is not None:
@@ -453,9 +460,11 @@ def _pose_of_view(view: View) -> Array:
     if numbers.size != 16:
         raise ValueError(f"a view has 16 numbers, column by column; got {numbers.size}")
     gl_from_world = numbers.reshape(4, 4).T
-    rotation = gl_from_world[:3, :3]
-    if not abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3:
-        raise ValueError(f"a view is a rotation and a translation; got {numbers.tolist()}")
+    rotation, last = gl_from_world[:3, :3], gl_from_world[3] - (0, 0, 0, 1)
+    if not max(abs(rotation @ rotation.T - np.eye(3)).max(), abs(last).max()) < 1e-3:
+        raise ValueError(
+            f"a view is a rotation and a translation, column by column; got {numbers.tolist()}"
+        )
     return rigid_inverse(gl_from_world) @ _GL_FROM_CV
 
 

@@ -365,6 +365,17 @@ def test_the_flow_of_soft_bodies_is_unknown(world):
     here = seen["instance"][0] == camera.rows[cloth, -1]
     assert here.sum() > 20
     assert not flow_of(seen, camera.K)[1][here].any()
+    with pytest.raises(ValueError, match=f"link -1 of body {cloth}"):
+        BulletCamera(world, 60, 40, fov_deg=60, link=(cloth, -1)).reset()
+
+
+def test_a_projection_may_be_a_matrix_of_four_columns(world):
+    numbers = pybullet.computeProjectionMatrix(-0.07, 0.03, -0.02, 0.05, 0.1, 20.0)
+    flat, square = (
+        BulletCamera(world, 60, 40, projection=each, view=VIEW).reset()["depth"]
+        for each in (numbers, np.reshape(numbers, (4, 4)))
+    )
+    assert np.array_equal(flat, square)
 
 
 @pytest.mark.parametrize(
@@ -380,6 +391,10 @@ def test_the_flow_of_soft_bodies_is_unknown(world):
         ({"fov_deg": 60, "view": None}, "view"),
         ({"fov_deg": 60, "view": [1.0] * 15}, "16"),
         ({"fov_deg": 60, "view": [2.0] * 16}, "rotation"),
+        ({"fov_deg": 60, "view": column_major(VIEW)}, "column by column"),
+        ({"fov_deg": 60, "physicsClientId": 0}, "client.*physicsClientId"),
+        ({"fov_deg": 60, "projectionMatrix": [1.0] * 16}, "projection.*projectionMatrix"),
+        ({"fov_deg": 60, "flags": pybullet.ER_NO_SEGMENTATION_MASK}, "ER_NO_SEGMENTATION_MASK"),
         ({"fov_deg": 60, "link": (0, 3)}, r"link 3.*0: '0 links'"),
         ({"fov_deg": 60, "link": (7, -1)}, "body 7"),
     ],
