@@ -250,7 +250,10 @@ class BulletCamera:
             if each.number == body and -1 <= link < len(each.parents):
                 world_from_link = poses[tag][1 + link] @ each.mass_from_link[1 + link]
                 if np.isnan(world_from_link).any():
-                    raise ValueError(f"link {link} of body {body} has no known pose for a camera")
+                    raise ValueError(
+                        f"the pose of link {link} of body {body} is unknown: it diverged, is soft, "
+                        "behind a planar joint, or was loaded with useMaximalCoordinates"
+                    )
                 return world_from_link if view is None else world_from_link @ _pose_of_view(view)
         raise ValueError(
             f"no body {body} with a link {link}; there are "
@@ -405,6 +408,8 @@ class _Body:
         self.joints = [link for link in links if infos[link][2] != pybullet.JOINT_FIXED]
         inertial = [base[3:5], *(state[2:4] for state in states)]
         self.mass_from_link = rigid_inverse(_transforms(*zip(*inertial)))
+        if base[10] == _RIGID:
+            self.mass_from_link[0] = np.nan  # PyBullet returns uninitialised memory
         # In Bullet, a joint is at the origin of its link. Its axis and frame have the axes of the
         # link's inertia, and its rotation leads from the parent to the link.
         turned = _transforms([(0.0, 0.0, 0.0)] * len(infos), [info[15] for info in infos])

@@ -331,6 +331,8 @@ def test_links_that_pybullet_hides_are_refused(world):
     ball = world.createMultiBody(1.0, -1, ball, [0, 0, 0.3], useMaximalCoordinates=True)
     camera = BulletCamera(world, 60, 40, fov_deg=60, view=VIEW)
     assert (camera.reset()["instance"] == camera.rows[ball, -1]).sum() > 10
+    with pytest.raises(ValueError, match=f"link -1 of body {ball}.*useMaximalCoordinates"):
+        BulletCamera(world, 60, 40, fov_deg=60, link=(ball, -1)).reset()
     world.loadURDF("r2d2.urdf", [0, 0, 0.5], useMaximalCoordinates=True)
     with pytest.raises(ValueError, match=r"body 2.*useMaximalCoordinates"):
         camera()
