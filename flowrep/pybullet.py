@@ -111,6 +111,8 @@ class BulletCamera:
     ) -> None:
         if not 1 <= max_instances < 1 << 15:
             raise ValueError(f"max_instances must be 1 to {(1 << 15) - 1}, got {max_instances}")
+        if min(width, height) < 1:
+            raise ValueError(f"width and height must be at least 1, got {width} and {height}")
         if taken := {"physicsClientId", "projectionMatrix", "viewMatrix"} & picture.keys():
             raise ValueError(f"give client, projection or view instead of {', '.join(taken)}")
         if picture.get("flags", 0) & pybullet.ER_NO_SEGMENTATION_MASK:

@@ -390,6 +390,7 @@ def test_a_projection_may_be_a_matrix_of_four_columns(world):
         ({"fov_deg": 180}, "fov_deg"),
         ({"fov_deg": 60, "near_m": 2, "far_m": 1}, "near_m"),
         ({"fov_deg": 60, "max_instances": 0}, "max_instances"),
+        ({"fov_deg": 60, "height": 0}, "height"),
         ({"fov_deg": 60, "view": None}, "view"),
         ({"fov_deg": 60, "view": [1.0] * 15}, "16"),
         ({"fov_deg": 60, "view": [2.0] * 16}, "rotation"),
@@ -403,7 +404,7 @@ def test_a_projection_may_be_a_matrix_of_four_columns(world):
 )
 def test_invalid_arguments_are_refused_by_name(world, options, names):
     with pytest.raises(ValueError, match=names):
-        BulletCamera(world, 60, 40, **{"view": VIEW, **options}).reset()
+        BulletCamera(world, **{"width": 60, "height": 40, "view": VIEW, **options}).reset()
 
 
 # Envs of others
