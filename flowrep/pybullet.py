@@ -43,9 +43,9 @@ class BulletCamera:
     | `semantic`, with `classes` | uint8 `[1, H, W]` | |
     | `rgb`, with `rgb=True` | uint8 `[3, H, W]` | |
 
-    A body keeps its row while it exists. The motion of a body that didn't exist at the last call is
-    nan, like that of a soft body, so that its flow is unknown. The poses of links are those at
-    which they are drawn: `getLinkState` lags one substep behind, and with
+    A body keeps its row in an episode while it exists. The motion of a body that didn't exist at
+    the last call is nan, like that of a soft body, so that its flow is unknown. The poses of links
+    are those at which they are drawn: `getLinkState` lags one substep behind, and with
     `computeForwardKinematics` it would change what the env reads next. Each body is marked once
     with PyBullet's `addUserData`, to distinguish it from another body that gets its number later;
     nothing else in the world changes.
@@ -75,7 +75,7 @@ class BulletCamera:
 
     Raises:
         ValueError: arguments don't fit together, the world has more than `max_instances` bodies and
-            links, or `link` doesn't exist.
+            links, or `link` doesn't exist or has no known pose.
 
     Example:
         >>> client = pybullet.connect(pybullet.DIRECT)
@@ -198,7 +198,8 @@ class BulletCamera:
         if matrix[~free].any() or matrix[3, 2] != -1 or not 0 < near_m < far_m:
             raise ValueError(
                 "projection must be that of a perspective camera, as computeProjectionMatrixFOV "
-                f"and computeProjectionMatrix return it; got {projection.tolist()}"
+                "and computeProjectionMatrix return it, with the far plane less than 1e7 times as "
+                f"far as the near plane; got {projection.tolist()}"
             )
         half = self.width / 2, self.height / 2
         fx, fy = half[0] * float(matrix[0, 0]), half[1] * float(matrix[1, 1])

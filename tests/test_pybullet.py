@@ -389,6 +389,7 @@ def test_a_projection_may_be_a_matrix_of_four_columns(world):
         ({"projection": [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1]}, "perspective"),
         ({"fov_deg": 180}, "fov_deg"),
         ({"fov_deg": 60, "near_m": 2, "far_m": 1}, "near_m"),
+        ({"fov_deg": 60, "near_m": 0.001, "far_m": 1e5}, "far plane"),
         ({"fov_deg": 60, "max_instances": 0}, "max_instances"),
         ({"fov_deg": 60, "height": 0}, "height"),
         ({"fov_deg": 60, "view": None}, "view"),
