@@ -399,8 +399,8 @@ class _Body:
         base = client.getDynamicsInfo(number, -1)
         if base[10] == _RIGID and len(client.getVisualShapeData(number)) > 1:
             raise ValueError(
-                f"body {number} was loaded with useMaximalCoordinates: PyBullet "
-                "draws its links under one id and doesn't report their poses; load it without"
+                f"body {number} has several shapes and useMaximalCoordinates: PyBullet draws the "
+                "links of such a body under one id and doesn't report their poses; load it without"
             )
         self.is_soft = base[10] == _SOFT
         links = range(0 if self.is_soft else client.getNumJoints(number))
@@ -468,8 +468,7 @@ def _pose_of_view(view: View) -> Array:
     if numbers.size != 16:
         raise ValueError(f"a view has 16 numbers, column by column; got {numbers.size}")
     gl_from_world = numbers.reshape(4, 4).T
-    rotation, last = gl_from_world[:3, :3], gl_from_world[3] - (0, 0, 0, 1)
-    if not max(abs(rotation @ rotation.T - np.eye(3)).max(), abs(last).max()) < 1e-3:
+    if not abs(rigid_inverse(gl_from_world) @ gl_from_world - np.eye(4)).max() < 1e-3:
         raise ValueError(
             f"a view is a rotation and a translation, column by column; got {numbers.tolist()}"
         )

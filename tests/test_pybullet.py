@@ -396,6 +396,7 @@ def test_a_projection_may_be_a_matrix_of_four_columns(world):
         ({"fov_deg": 60, "view": [1.0] * 15}, "16"),
         ({"fov_deg": 60, "view": [2.0] * 16}, "rotation"),
         ({"fov_deg": 60, "view": column_major(VIEW)}, "column by column"),
+        ({"fov_deg": 60, "view": [*VIEW[:12], math.nan, *VIEW[13:]]}, "rotation"),
         ({"fov_deg": 60, "physicsClientId": 0}, "client.*physicsClientId"),
         ({"fov_deg": 60, "projectionMatrix": [1.0] * 16}, "projection.*projectionMatrix"),
         ({"fov_deg": 60, "flags": pybullet.ER_NO_SEGMENTATION_MASK}, "ER_NO_SEGMENTATION_MASK"),
