@@ -178,6 +178,10 @@ def test_a_mistake_and_another_that_fits_as_well_are_told_together():
     assert len(found.suspects) <= 3
 
 
+def test_flow_to_the_next_frame_is_no_mistake_where_the_camera_moves_evenly():
+    assert found_of(with_mistake("flow to the next frame", 93)).is_right
+
+
 @pytest.mark.parametrize("seed", [84364, 84399])
 def test_a_mistake_below_what_the_pictures_show_is_not_named(seed):
     kind, found, _ = outcome(drawn(seed), *mistaken(drawn(seed), seed))
