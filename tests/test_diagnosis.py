@@ -18,7 +18,7 @@ from tensordict import TensorDict
 
 pytest.importorskip("cv2", reason="recordings need OpenCV")
 
-from benchmarks.diagnosis import examined, found_of, outcome, tensordict_of
+from benchmarks.diagnosis import ADMITTED, examined, found_of, outcome, tensordict_of
 from benchmarks.mistakes import FLU, LISTED, OPENGL, UNLISTED
 from benchmarks.mistakes import drawn as mistaken
 from benchmarks.shots import draw, frames_of
@@ -360,6 +360,7 @@ def test_half_a_picture_of_sky_is_no_noise_of_depth():
     found = diagnose(TensorDict({"sensor": sensor}, [8]), K)
     assert found.is_right
     assert found.error_px < 0.05
+    assert any(ADMITTED["bodies"] in note for note in found.notes)  # as its rates count it
 
 
 def test_what_transforms_wrote_is_computed_again(frames):

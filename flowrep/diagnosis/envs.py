@@ -242,7 +242,7 @@ def _bodies(seen: _Seen, world_px: float) -> tuple[str, str]:
     world's residual `world_px`, of the camera's poses, is no fault of a body's.
     """
     count, ids = seen.rows.shape[1], seen.ids[:, 0]
-    unseen = "moving bodies are hardly seen: their ids and motions are not tested"
+    unseen = "moving bodies are hardly seen: ids and motions of bodies are not tested"
     if not seen.has_rows:
         return "untested", unseen
     if int(ids.min()) < 0 or int(ids.max()) >= count:
