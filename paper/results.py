@@ -1,7 +1,7 @@
 """The page of results: `make results` writes paper/results.md and its figures.
 
 claims.py tests what claims.yaml declares, results.md.jinja has the words around the numbers, and
-all numbers come from the packed runs.
+all numbers come from the packed runs. tests/test_readme.py compares the README's table with them.
 """
 
 import csv
@@ -18,7 +18,7 @@ from jinja2 import FileSystemLoader
 from matplotlib.figure import Figure
 from scipy import stats
 
-from flowrep.report.cells import p_text, percent, points, signed
+from flowrep.report.cell_text import p_text, percent, points, signed
 from flowrep.report.figures import draw_bars, draw_curves, encoded, styled, words
 from flowrep.report.page import TEMPLATES
 from flowrep.report.runs import (

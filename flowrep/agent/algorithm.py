@@ -337,7 +337,10 @@ def transition_keys(codecs: Sequence[MapCodec]) -> list[NestedKey]:
 
 
 def td_target(batch: TensorDictBase, next_value: Tensor, gamma: float) -> Tensor:
-    """Returns r + γⁿ (1 - terminated) V(s') `[N]` of sampled transitions, given V(s') `[N, 1]`."""
+    """Returns r + γⁿ (1 - terminated) V(s') `[N]` of sampled transitions, given V(s') `[N, 1]`.
+
+    In flowrep's streets every end is `terminated`, also a time-out.
+    """
     outcome = batch["next"]
     # Masked instead of multiplied, because the value after an end may be nan.
     next_value = next_value.masked_fill(outcome["terminated"], 0.0)

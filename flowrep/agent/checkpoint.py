@@ -1,5 +1,7 @@
 """Saves and loads checkpoints: tensors and plain data in one file, written atomically.
 
+`experiment.runner` saves one every `checkpoint_every_frames`, in place of the last.
+
 The file is a safetensors file. The metadata in its header hold a JSON document that mirrors the
 nested state, with each tensor as `{"tensor": name}` and each dict as `{"dict": items}`. Nothing in
 it can run code. `torchrl.checkpoint` loses the last checkpoint if it is killed between its two

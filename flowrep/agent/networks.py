@@ -1,7 +1,8 @@
 """Networks and policies: one Nature encoder per map, then a head with one number per action.
 
 Weights are float32. By autocast, encoders and hidden layers compute in the codec's dtype. The last
-layer computes in float32, because small differences between its outputs matter.
+layer computes in float32, because small differences between its outputs matter. `hidden_size` is an
+option of an algorithm; the encoder's widths stand in `NatureEncoder`.
 """
 
 from __future__ import annotations

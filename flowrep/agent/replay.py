@@ -67,7 +67,7 @@ class PackSteps(Transform):
     | steps, on `extend` | rows |
     | --- | --- |
     | `[N]`, `[N, T]`, or with a dim named `time` | `[T * N]`, time first |
-    | the maps | in their stored form |
+    | the maps | uint8, or floats of 16 bits (`MapCodec.stored_dtype`) |
     | `action`, `is_init` | unchanged |
     | `("next", name)` of `reward`, `done`, `terminated` | `name` |
     | | `env`: index of the env, from 0 to N - 1 |

@@ -1,4 +1,4 @@
-"""The verdict on pairs of frames: which explanation of them is the likeliest, and what it hides."""
+"""The verdict on pairs of frames: the likeliest explanation, and what it hides, by the `limits`."""
 
 from __future__ import annotations
 

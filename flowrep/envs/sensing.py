@@ -1,4 +1,7 @@
-"""What a street's camera observes: maps, and motions of camera and bodies since the last step."""
+"""What a street's camera observes: maps, and motions of camera and bodies since the last step.
+
+The camera itself is `camera:` of the scene's file or of a preset.
+"""
 
 from collections.abc import Sequence, Set
 from typing import Any, Protocol

@@ -296,12 +296,11 @@ class StreetEnv(gym.Env):
 
     def step(self, action: int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Drives one step; every end of an episode is `terminated`, also a time-out."""
-        outcome = self.drive(action)
-        observation = self.sensing.observe(self.episode)
-        return observation, reward(outcome), outcome != Outcome.RUNNING, False, self._info()
+        earned, is_end = self.drive(action)
+        return self.sensing.observe(self.episode), earned, is_end, False, self._info()
 
-    def drive(self, action: int) -> Outcome:
-        """Drives one step like `step`, without an observation."""
+    def drive(self, action: int) -> tuple[float, bool]:
+        """Drives one step like `step`, and returns the reward and whether the episode ends."""
         episode = self._opened()
         if action not in range(len(YAW_SIGN)):
             raise ValueError(
@@ -310,7 +309,7 @@ class StreetEnv(gym.Env):
         if ended := episode.outcome:
             raise RuntimeError(f"the episode has ended ({ended.label}): call reset() first")
         episode.step(int(action), self._street)
-        return episode.outcome
+        return reward(episode.outcome), episode.outcome != Outcome.RUNNING
 
     def render(self) -> Any:
         """Returns the camera's picture, [H, W, 3] uint8, if the render mode is "rgb_array"."""

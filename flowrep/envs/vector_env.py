@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
 from flowrep.envs.sensing import EPISODE_SEEDS
-from flowrep.envs.street_env import NOTHING_HIT, Episode, Outcome, reward
+from flowrep.envs.street_env import NOTHING_HIT, Episode, Outcome
 from flowrep.envs.workers import copy_into_rows
 
 _STATUS: dict[str, Any] = {
@@ -102,8 +102,7 @@ class StreetVectorEnv(SyncVectorEnv):
             if self._autoreset_envs[i]:
                 self._streets[i].begin()
             else:
-                outcome = self._streets[i].drive(actions[i].item())
-                rewards[i], ended[i] = reward(outcome), outcome != Outcome.RUNNING
+                rewards[i], ended[i] = self._streets[i].drive(actions[i].item())
         if self.autoreset_mode == AutoresetMode.NEXT_STEP:
             self._autoreset_envs = ended.copy()
         return self._observe(driven), rewards, ended, np.zeros_like(ended), {}

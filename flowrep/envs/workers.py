@@ -58,7 +58,8 @@ class WorkerVectorEnv(VectorEnv):
     Args:
         env_factories: one picklable factory for each env, from a module that can be imported; all
             envs have the same spaces, with a `Dict` of observations.
-        num_workers: number of processes, at most one for each env.
+        num_workers: number of processes, at most one for each env; `experiment.build` turns the
+            commands' `auto` into it.
         in_each: makes a vector env without autoreset from the envs of one worker.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Runs whole episodes of any policy.
+"""Runs whole episodes of any policy; `run.RunFolder` writes their records.
 
 Training, `flowrep.evaluate`, films, `flowrep.view` and baselines all drive through `evaluate`.
 """
@@ -34,6 +34,7 @@ FIRST_SEEDS = {"training": 1_000_000, "final": 1_500_000, "evaluate": 2_000_000}
 """The seed of the first episode of each kind of evaluation, far enough apart that none overlap.
 
 The keys are the values of the column `evaluation`; conf/evaluate.yaml has the last seed, too.
+Training draws its episodes from 2³¹ seeds.
 """
 EVALUATION_ENVS = 192  # side by side: more make a step of each cheaper
 

@@ -150,7 +150,10 @@ class RunFolder:
         return config
 
     def config(self, trusted: Collection[str] = ()) -> TrainConfig:
-        """Returns the resolved config as its model; see `validated_run` for `trusted`."""
+        """Returns the resolved config as its model; see `validated_run` for `trusted`.
+
+        `train.resumed` decides what `resume=` may change.
+        """
         return validated_run(self.read_config(), str(self.config_path), trusted)
 
     def log_machine(self, machine: Mapping[str, Any]) -> None:

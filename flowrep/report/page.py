@@ -7,7 +7,7 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
 
-from flowrep.report.cells import listed
+from flowrep.report.cell_text import listed
 from flowrep.report.figures import encoded, words
 from flowrep.report.runs import Run, scenes_of
 from flowrep.report.sections import Report

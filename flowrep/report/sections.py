@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from flowrep.config.cli import line_for
 from flowrep.files import refuse_link, replace_bytes, replace_text
-from flowrep.report.cells import listed
+from flowrep.report.cell_text import listed
 from flowrep.report.figures import draw_bars, draw_curves, draw_rates, encoded
 from flowrep.report.runs import (
     COMPLEMENTARY_STACKS,

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import NamedTuple
 
-from flowrep.report.cells import MISSING, p_text, percent, points, ratio
+from flowrep.report.cell_text import MISSING, p_text, percent, points, ratio
 from flowrep.report.figures import words
 from flowrep.report.runs import (
     Condition,

@@ -183,7 +183,10 @@ class Crowd:
 
 
 def draw_crowd(layout: Layout, speed_mps: Range, rng: np.random.Generator) -> Crowd:
-    """Returns a crowd with phases, directions, speeds and lanes drawn for one episode."""
+    """Returns a crowd with phases, directions, speeds and lanes drawn for one episode.
+
+    `speed_mps` is the range of the speed mode, `pedestrian_speed_mps` of the scene's file.
+    """
     lines: list[Array] = []
     speeds, phases = [np.empty(0)], [np.empty(0)]
     size = layout.scene.largest_size

@@ -20,8 +20,8 @@ def match_times(
 ) -> tuple[Indices, Floats]:
     """Returns the rows around each wanted time, `[2, frames]`, and the share of the way between.
 
-    Without `interpolate` both rows are the nearest. They are -1 if they are too far away, or if
-    rows on both sides are needed and there are none.
+    Without `interpolate` both rows are the nearest. They are -1 if they are farther away than
+    the format's `tolerance_s`, or if rows on both sides are needed and there are none.
     """
     after = np.searchsorted(times_s, wanted_s).clip(0, len(times_s) - 1)
     before = np.where(times_s[after] <= wanted_s, after, after - 1).clip(0)

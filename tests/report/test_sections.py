@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("scipy", reason="reports are an extra")
 
-from flowrep.report.cells import listed, p_text, percent, points, ratio
+from flowrep.report.cell_text import listed, p_text, percent, points, ratio
 from flowrep.report.runs import Condition, cell_of, changes, curve_of, paired_scores, read_runs
 from flowrep.report.sections import Report, ReportSection, assemble, write_files
 from flowrep.report.statistics import Estimate
