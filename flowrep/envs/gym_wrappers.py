@@ -148,7 +148,8 @@ class RepresentationVectorObservation(gym.vector.VectorWrapper):
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Maps, dict[str, Any]]:
         """Begins episodes, see `StreetVectorEnv.reset`."""
-        begun = (options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool))
+        mask = (options or {}).get("reset_mask", np.ones(self.num_envs))
+        begun = np.asarray(mask, dtype=bool)  # numbers would be indices
         observation, _ = self.env.reset(seed=seed, options=options)
         self._ended = self._ended & ~begun
         return self._maps(observation["sensor"], begun, self._now.clone()), _numbers(observation)

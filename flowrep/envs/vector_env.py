@@ -102,7 +102,7 @@ class StreetVectorEnv(SyncVectorEnv):
             if self._autoreset_envs[i]:
                 self._streets[i].begin()
             else:
-                rewards[i], ended[i] = self._streets[i].drive(actions[i].item())
+                rewards[i], ended[i] = self._streets[i].drive(np.asarray(actions[i]).item())
         if self.autoreset_mode == AutoresetMode.NEXT_STEP:
             self._autoreset_envs = ended.copy()
         return self._observe(driven), rewards, ended, np.zeros_like(ended), {}

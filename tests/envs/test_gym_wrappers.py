@@ -102,6 +102,12 @@ def test_streets_of_make_vec_are_single_streets_side_by_side(joined):
     assert one[0] in ours.observation_space
     again = {"seed": [7, None, None], "options": {"reset_mask": np.array([True, False, False])}}
     assert differing(*(envs.reset(**again)[0] for envs in (ours, theirs))) == []
+    assert differing(*(envs.step([1, 0, 0])[0] for envs in (ours, theirs))) == []
+    moving = ours.step([1, 0, 0])[0]
+    second, _ = ours.reset(options={"reset_mask": np.array([0, 1, 0])})  # no rows
+    for name in second if isinstance(second, dict) else [...]:
+        kept = (second[name] == moving[name]).reshape(3, -1).all(1)
+        assert kept.tolist() == [True, False, True]
 
 
 class Wall(gymnasium.Env):
