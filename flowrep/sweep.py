@@ -68,10 +68,12 @@ def run_sweep() -> NoReturn:
             "resume= continues one run; to continue a sweep, repeat its command with "
             "hydra.sweep.dir=<its folder>"
         )
+    if "hydra.run.dir" in keys:
+        cli.exit_with("hydra.run.dir= is of a single run; for a sweep, give hydra.sweep.dir=")
     typed = [text for text, key in zip(sys.argv[1:], keys) if key != "hydra.sweep.dir"]
     folders = [cli.value_of(text) for text in sys.argv[1:] if text not in typed]
     new = f"outputs/{datetime.now():%Y-%m-%d/%H-%M-%S}_sweep"
-    folder = Path(folders[-1] if folders else new).absolute()
+    folder = Path(folders[-1] if folders else new).expanduser().absolute()
     given = cli.override("hydra.sweep.dir", str(folder))
     # argparse needs all overrides side by side, and flags with values may surround them.
     are_keys = ["=" in text and not text.startswith("-") for text in typed]

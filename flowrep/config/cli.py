@@ -267,7 +267,9 @@ def as_typed(arguments: Sequence[str], schema: type[Command]) -> list[str]:
         if is_argument and "run" in schema.model_fields and names_run:
             folders.append(override("run", text).removeprefix("run="))
         else:
-            others.append(override(key, value) if _is_folder(key, value) else text)
+            if is_folder := _is_folder(key, value):
+                value = os.path.expanduser(value)  # which shells don't do after `hydra.run.dir=`
+            others.append(override(key, value) if is_folder else text)
         previous = text
     if folders and any(text.startswith("run=") for text in others):
         raise UsageError(f"{folders[0]} and run= both name folders: leave out run=")

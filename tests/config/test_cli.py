@@ -272,6 +272,7 @@ FOLDERS = [
     ("run=a,b=[c]", "a,b=[c]"),  # which is there
     ("output=1e3", "1e3"),
     ("hydra.sweep.dir=/home/josé/x (2)", "/home/josé/x (2)"),
+    ("hydra.run.dir=~/x", "/home/josé/x"),  # where a shell keeps the ~
     # none, or none yet
     ("run=[a,b]", ["a", "b"]),
     ("input=0", 0),  # a camera's number
@@ -285,6 +286,7 @@ def test_a_folders_name_is_taken_literally_and_other_values_are_not(
     tmp_path, monkeypatch, typed, value
 ):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", "/home/josé")
     (tmp_path / "a,b=[c]").mkdir()
     (line,) = cli.as_typed([typed], SCHEMAS["train"])
     assert OverridesParser.create().parse_overrides([line])[0].value() == value

@@ -136,22 +136,27 @@ def test_a_killed_worker_of_a_launcher_is_no_traceback(monkeypatch, tmp_path, ca
     assert "Traceback" not in said
 
 
-@pytest.mark.parametrize(("plus", "run"), [("", "a"), ("++", "a"), ("", "a/b")])
+@pytest.mark.parametrize(
+    ("plus", "typed", "run"),
+    [("", "{}", "a"), ("++", "{}", "a"), ("", "{}", "a/b"), ("", "~", "a")],
+)
 def test_a_sweep_finds_its_failed_runs_in_the_folder_that_was_typed(
-    monkeypatch, tmp_path, plus, run
+    monkeypatch, tmp_path, plus, typed, run
 ):
     def fail(*_):
         (tmp_path / run).mkdir(parents=True)
         (tmp_path / run / sweep.LOG).write_text("--- failed: error: no space\n")
 
     monkeypatch.setattr(cli, "run_hydra", fail)
-    line = ["python", "-m", "flowrep.train", "--multirun", f"{plus}hydra.sweep.dir={tmp_path}"]
-    assert run_here(monkeypatch, line) == 1
+    monkeypatch.setenv("HOME", str(tmp_path))
+    given = f"{plus}hydra.sweep.dir={typed.format(tmp_path)}"
+    assert run_here(monkeypatch, ["python", "-m", "flowrep.train", "--multirun", given]) == 1
 
 
-@pytest.mark.parametrize("plus", ["", "++"])
-def test_a_sweep_of_one_run_to_continue_is_refused(monkeypatch, capsys, plus):
-    line = ["python", "-m", "flowrep.train", "--multirun", f"{plus}resume=outputs/a"]
+@pytest.mark.parametrize("key", ["resume", "++resume", "hydra.run.dir"])
+def test_a_folder_of_one_run_is_refused_for_a_sweep(monkeypatch, capsys, key):
+    monkeypatch.setattr(cli, "run_hydra", lambda *_: None)
+    line = ["python", "-m", "flowrep.train", "--multirun", f"{key}=outputs/a"]
     assert run_here(monkeypatch, line) == 2
     assert "hydra.sweep.dir=" in capsys.readouterr().err
 
