@@ -115,6 +115,11 @@ class BulletCamera:
             raise ValueError(f"width and height must be at least 1, got {width} and {height}")
         if taken := {"physicsClientId", "projectionMatrix", "viewMatrix"} & picture.keys():
             raise ValueError(f"give client, projection or view instead of {', '.join(taken)}")
+        for body, of in (classes or {}).items():
+            if not hasattr(body, "__index__") or of not in range(256):
+                raise ValueError(
+                    f"classes are ids, 0 to 255, by the number of a body; got {body!r}: {of!r}"
+                )
         if picture.get("flags", 0) & pybullet.ER_NO_SEGMENTATION_MASK:
             raise ValueError("without a segmentation mask (ER_NO_SEGMENTATION_MASK), no instances")
         self._client = _Client(int(client)) if isinstance(client, int | np.integer) else client

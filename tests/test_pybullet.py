@@ -400,6 +400,8 @@ def test_a_projection_may_be_a_matrix_of_four_columns(world):
         ({"fov_deg": 60, "physicsClientId": 0}, "client.*physicsClientId"),
         ({"fov_deg": 60, "projectionMatrix": [1.0] * 16}, "projection.*projectionMatrix"),
         ({"fov_deg": 60, "flags": pybullet.ER_NO_SEGMENTATION_MASK}, "ER_NO_SEGMENTATION_MASK"),
+        ({"fov_deg": 60, "classes": {PLANE: 1, (PLANE, -1): 2}}, r"classes.*\(0, -1\): 2"),
+        ({"fov_deg": 60, "classes": {PLANE: 256}}, "classes.*0: 256"),
         ({"fov_deg": 60, "link": (0, 3)}, r"link 3.*0: '0 links'"),
         ({"fov_deg": 60, "link": (7, -1)}, "body 7"),
     ],
