@@ -13,6 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from flowrep.agent import cpu, load_checkpoint, save_checkpoint, torch_threads
 from flowrep.agent.cuda_graph import with_fixed_layout
 from flowrep.agent.divergence import DivergenceError, DivergenceWatch
+from tests.comparing import differing
 from tests.running import glossary, run_python
 
 ENVS = 5
@@ -93,8 +94,7 @@ def test_a_resumed_agent_equals_an_uninterrupted_one_bit_for_bit(make_any, rando
     assert len(expected) == len(actual) > 0
     for a, b in zip(expected, actual):
         assert all(torch.equal(a[name].nan_to_num(7), b[name].nan_to_num(7)) for name in a)
-    a, b = weights(whole), weights(resumed)
-    assert [name for name in a if not torch.equal(a[name], b[name])] == []
+    assert differing(weights(whole), weights(resumed)) == []
 
 
 @pytest.mark.slow_after_first
@@ -122,7 +122,7 @@ def test_an_agent_that_diverged_keeps_its_weights_until_a_state_is_loaded(make_a
     after = diverge()
     for batch in batches:
         new.update(batch.clone())
-    assert [name for name, w in weights(new).items() if not torch.equal(w, after[name])] == []
+    assert differing(weights(new), after) == []
 
 
 def test_a_state_of_other_maps_is_refused_with_a_weight_that_differs(make_agent):

@@ -57,16 +57,16 @@ def with_metadata(**metadata):
     return lambda path: save_file({"a": torch.ones(2)}, path, metadata=metadata or None)
 
 
-@pytest.mark.parametrize(
-    "damage",
-    [
-        pytest.param(truncated, id="truncated"),
-        pytest.param(lambda path: path.write_bytes(pickle.dumps({"a": 1})), id="pickle"),
-        pytest.param(with_metadata(), id="foreign"),
-        pytest.param(with_metadata(format="flowrep checkpoint 2", state="{}"), id="other version"),
-        pytest.param(lambda path: None, id="missing"),
-    ],
-)
+DAMAGES = {
+    "truncated": truncated,
+    "pickle": lambda path: path.write_bytes(pickle.dumps({"a": 1})),
+    "foreign": with_metadata(),
+    "other version": with_metadata(format="flowrep checkpoint 2", state="{}"),
+    "missing": lambda path: None,
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES.values(), ids=list(DAMAGES))
 def test_a_file_that_is_no_checkpoint_is_named(tmp_path, damage):
     path = tmp_path / "c.safetensors"
     damage(path)

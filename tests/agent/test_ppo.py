@@ -23,6 +23,13 @@ def make_ppo(**changes):
     return PPO(SPEC, Categorical(3), ["view"], options, total_frames=600)
 
 
+def ppo_after_a_rollout(**changes):
+    agent = make_ppo(**changes)
+    for each in STEPS:
+        agent.remember(each)
+    return agent
+
+
 def step(now, later, reward, ended="--"):
     """One step of two environments whose maps show a number; t(erminated), c(ut off) or -."""
     one = stored_step(now, later, ended, action=[1, 2])
@@ -65,9 +72,7 @@ def test_a_complete_rollout_is_learnt_from_in_shuffled_passes_and_then_forgotten
 
 def test_advantages_are_those_worked_by_hand():
     """Environment 0 terminates in its second step, environment 1 is cut off in its third."""
-    agent = make_ppo(batch_size=8, epochs=1)
-    for each in STEPS:
-        agent.remember(each)
+    agent = ppo_after_a_rollout(batch_size=8, epochs=1)
     agent.weights["critic_network_params.module.output.weight"].data.mul_(10)
     batch = agent.sample()
     steps = batch[batch["next", "reward"].flatten().argsort()]  # rewards count the steps from 1 on
@@ -93,9 +98,7 @@ def test_advantages_are_those_worked_by_hand():
 
 def test_a_step_is_weighted_by_how_likely_it_was_under_the_weights_that_acted():
     """The training loop begins the next rollout before it learns from the last one."""
-    agent = make_ppo(gamma=0.0, clip=0.9, batch_size=8, epochs=1)
-    for each in STEPS:
-        agent.remember(each)
+    agent = ppo_after_a_rollout(gamma=0.0, clip=0.9, batch_size=8, epochs=1)
     batch = agent.sample()
     with torch.no_grad():
         image = agent.codecs[0].decode(batch["view"])
@@ -114,9 +117,7 @@ def test_a_step_is_weighted_by_how_likely_it_was_under_the_weights_that_acted():
 
 
 def test_gradients_are_scaled_down_to_the_largest_norm():
-    agent = make_ppo(max_grad_norm=1e-3)
-    for each in STEPS:
-        agent.remember(each)
+    agent = ppo_after_a_rollout(max_grad_norm=1e-3)
     norm = agent.update(agent.sample())["grad_norm"]
     gradients = torch.cat([w.grad.flatten() for w in agent.trained.values()])
     assert norm > 0.01

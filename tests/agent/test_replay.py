@@ -47,6 +47,14 @@ def step(seen, following, ended="", action=None, begun=""):
     )
 
 
+def stored(*steps, **options):
+    """The transitions of a memory of these steps."""
+    replay = memory(**options)
+    for each in steps:
+        replay.extend(each)
+    return transitions(replay)
+
+
 def transitions(replay):
     """The distinct (seen, action, steps, reward, next, terminated) of a large sample, sorted."""
     batch = replay.sample()
@@ -90,10 +98,7 @@ def transitions(replay):
     ],
 )
 def test_the_next_observation_is_that_of_the_next_step_of_the_episode(steps, expected):
-    replay = memory()
-    for each in steps:
-        replay.extend(each)
-    assert transitions(replay) == expected
+    assert stored(*steps) == expected
 
 
 def test_two_episodes_are_not_joined_even_if_their_maps_are_equal():
@@ -122,26 +127,19 @@ def test_steps_may_come_one_by_one_or_in_a_batch_with_its_time_last_or_named():
         step([12, 40], [13, 41], ended="t-"),
         step([60, 41], [61, 42]),
     ]
-    one_by_one, at_once, named = memory(), memory(), memory()
-    for s in steps:
-        one_by_one.extend(s)
-    at_once.extend(torch.stack(steps[:3], 1))
-    at_once.extend(torch.stack(steps[3:], 1))
-    time_last = torch.stack(steps, 1)
-    time_last.names = [None, "time"]
-    named.extend(time_last)
+    named = torch.stack(steps, 1)
+    named.names = [None, "time"]
     expected = [
         (10, 10, 1, 11, 11, 0), (11, 11, 1, 12, 12, 0), (12, 12, 1, 13, 12, 1),
         (20, 20, 1, 21, 21, 0), (21, 21, 1, 22, 21, 1), (40, 40, 1, 41, 41, 0),
     ]  # fmt: skip
-    assert transitions(one_by_one) == transitions(at_once) == transitions(named) == expected
-    trajectory, single = memory(), memory()
-    steps = torch.cat([step([i], [i + 1]) for i in range(3)])
-    steps.names = ["time"]
-    trajectory.extend(steps)
-    assert [single.add(each) for each in steps.unbind(0)] == [0, 1, 2]
+    assert stored(*steps) == stored(named) == expected
+    assert stored(torch.stack(steps[:3], 1), torch.stack(steps[3:], 1)) == expected
+    trajectory, single = torch.cat([step([i], [i + 1]) for i in range(3)]), memory()
+    trajectory.names = ["time"]
+    assert [single.add(each) for each in trajectory.unbind(0)] == [0, 1, 2]
     expected = [(0, 0, 1, 1, 1, 0), (1, 1, 1, 2, 2, 0)]
-    assert transitions(trajectory) == transitions(single) == expected
+    assert stored(trajectory) == transitions(single) == expected
 
 
 def test_a_full_memory_overwrites_its_oldest_rows():
@@ -155,12 +153,10 @@ def test_a_full_memory_overwrites_its_oldest_rows():
 
 
 def test_a_transition_of_three_steps_sums_discounted_rewards_and_looks_three_frames_ahead():
-    replay = memory(n_steps=3, gamma=0.5)
-    for seen in range(10, 15):  # the reward of the step to 11 is 11
-        replay.extend(step([seen], [seen + 1]))
+    steps = [step([seen], [seen + 1]) for seen in range(10, 15)]  # the reward of that to 11 is 11
     # from 10: 11 + 12 / 2 + 13 / 4 = 20.25 and 13; undiscounted it would be 36. From 12 on, what
     # follows the third step is not stored: transitions are shorter
-    assert transitions(replay) == [
+    assert stored(*steps, n_steps=3, gamma=0.5) == [
         (10, 10, 3, 20.25, 13, 0),
         (11, 11, 3, 22.0, 14, 0),
         (12, 12, 2, 20.0, 14, 0),
@@ -169,13 +165,10 @@ def test_a_transition_of_three_steps_sums_discounted_rewards_and_looks_three_fra
 
 
 def test_a_transition_of_three_steps_ends_with_its_episode():
-    replay = memory(n_steps=3, gamma=0.5)
-    replay.extend(step([10, 20], [11, 21]))
-    replay.extend(step([11, 21], [12, 22], ended="tc"))
-    replay.extend(step([50, 60], [51, 61]))
-    replay.extend(step([51, 61], [52, 62]))
+    first = step([10, 20], [11, 21]), step([11, 21], [12, 22], ended="tc")
+    then = step([50, 60], [51, 61]), step([51, 61], [52, 62])
     # 10 ends at the terminal step, whose own map stands in; 20 before the one that was cut off
-    assert transitions(replay) == [
+    assert stored(*first, *then, n_steps=3, gamma=0.5) == [
         (10, 10, 2, 17.0, 11, 1),
         (11, 11, 1, 12.0, 11, 1),
         (20, 20, 1, 21.0, 21, 0),

@@ -50,16 +50,43 @@ def raw_flow(*batch: int) -> Tensor:
     return 5 * torch.randn((*batch, 2, HEIGHT, WIDTH), generator=generator, dtype=torch.float64)
 
 
-def flow_pixel_by_pixel(depth, K, motion, prev_K=None) -> Tensor:
-    """Returns flow `[2, H, W]`, unbatched, in plain floats: unproject, move, project to before."""
+def assert_equals_a_loop(function, batch, *maps, atol=0.0) -> tuple[Tensor, ...]:
+    """Compares each part of a batch's result with that of its elements one by one; returns it."""
+    together = function(*maps)
+    for at in product(*map(range, batch)):
+        for part, alone in zip(together, function(*(each[at] for each in maps))):
+            torch.testing.assert_close(part[at], alone, rtol=0, atol=atol)
+    return together
+
+
+def spoilt(tame: Tensor, share: float | Tensor, generator: torch.Generator) -> Tensor:
+    """Returns tame numbers of which a share has any size and sign, or is nan, inf, 0 or 1."""
+    sizes = 10 ** (100 * torch.rand(tame.shape, generator=generator, dtype=torch.float64) - 50)
+    signs = torch.randn(tame.shape, generator=generator).sign()
+    special = torch.tensor([math.nan, math.inf, -math.inf, 0.0, 1.0], dtype=torch.float64)
+    pick = torch.randint(0, 30, tame.shape, generator=generator)
+    wild = torch.where(pick < 5, special[pick.clamp(max=4)], sizes * signs)
+    return torch.where(torch.rand(tame.shape, generator=generator) < share, wild, tame)
+
+
+def flow_pixel_by_pixel(depth, K, motion, prev_K=None, instance=None) -> Tensor:
+    """Returns flow `[2, H, W]`, unbatched, in plain floats: unproject, move, project to before.
+
+    With ids, `motion` has a row for each. Flow is 0 where depth is nan.
+    """
     (fx, skew, cx), (_, fy, cy), _ = K.tolist()
     (fx_p, skew_p, cx_p), (_, fy_p, cy_p), _ = (K if prev_K is None else prev_K).tolist()
     out = torch.zeros(2, *depth.shape[-2:], dtype=torch.float64)
     for row, column in product(*map(range, depth.shape[-2:])):
         z = depth[0, row, column].item()
+        if math.isnan(z):
+            continue
+        # A point at infinity is a direction: the translation does not move it.
+        z, w = (1.0, 0.0) if math.isinf(z) else (z, 1.0)
+        rows = (motion if instance is None else motion[instance[0, row, column].item()]).tolist()
         y = z * (row + 0.5 - cy) / fy
         x = (z * (column + 0.5 - cx) - skew * y) / fx
-        before = [r[0] * x + r[1] * y + r[2] * z + r[3] for r in motion.tolist()]
+        before = [r[0] * x + r[1] * y + r[2] * z + r[3] * w for r in rows]
         u = (fx_p * before[0] + skew_p * before[1]) / before[2] + cx_p
         v = fy_p * before[1] / before[2] + cy_p
         out[0, row, column], out[1, row, column] = column + 0.5 - u, row + 0.5 - v

@@ -1,7 +1,5 @@
 """torch.compile, torch.export and CUDA give what eager PyTorch gives on a CPU."""
 
-from __future__ import annotations
-
 import io
 import math
 import shutil
@@ -41,27 +39,24 @@ def _fresh_compiler():
     torch._dynamo.reset()
 
 
-def assert_same(got, expected):
-    for part, eager in zip(got, expected):
-        torch.testing.assert_close(part, eager, rtol=0, atol=0, equal_nan=True)
+def there_and_back(depth, instance, K, *motions):
+    return (project(unproject(depth, K), K),)
 
 
-def test_camera_is_one_graph():
-    def there_and_back(depth, K):
-        return (project(unproject(depth, K), K),)
-
-    depth, _, camera, _ = inputs(2)
-    compiled = torch.compile(there_and_back, fullgraph=True, backend="eager")
-    assert_same(compiled(depth, camera), there_and_back(depth, camera))
-
-
-@pytest.mark.slow_after_first
 @pytest.mark.parametrize(
-    ("dt", "prev_K"), [(0.25, None), (torch.tensor([0.5, 2.0]), 1.1 * K.float())]
+    ("function", "more"),
+    [
+        (there_and_back, ()),
+        (everything, (0.25, None)),
+        pytest.param(
+            everything, (torch.tensor([0.5, 2.0]), 1.1 * K.float()), marks=pytest.mark.slow
+        ),
+    ],
 )
-def test_flow_is_one_graph(dt, prev_K):
-    compiled = torch.compile(everything, fullgraph=True, backend="eager")
-    assert_same(compiled(*inputs(2), dt, prev_K), everything(*inputs(2), dt, prev_K))
+def test_each_function_is_one_graph(function, more):
+    compiled = torch.compile(function, fullgraph=True, backend="eager")
+    for got, eager in zip(compiled(*inputs(2), *more), function(*inputs(2), *more)):
+        torch.testing.assert_close(got, eager, rtol=0, atol=0, equal_nan=True)
 
 
 @pytest.mark.slow

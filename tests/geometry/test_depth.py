@@ -1,7 +1,5 @@
 """Depth of other kinds, worked by hand."""
 
-from __future__ import annotations
-
 import math
 from itertools import product
 
@@ -69,33 +67,29 @@ def test_the_sky_of_pybullets_software_renderer_is_no_wall(as_float64):
     # 1.0000001, out of [0, 1], at (0.02, 20). Here a wall at 0.9 of the far plane fills the lower
     # half of each picture.
     bullet = pytest.importorskip("pybullet")
-    client = bullet.connect(bullet.DIRECT)
+    client = {"physicsClientId": bullet.connect(bullet.DIRECT)}
     nears = [0.01, 0.02, 0.05, 0.1, 0.2]
     fars = [2, 3, 4, 5, 6, 7, 8, 10, 12, 15, 20, 25, 30, 40, 50, 60, 70, 80, 100, 150, 200, 300]
-    inexact = 0
-    try:
-        view = bullet.computeViewMatrix([0, 0, 0], [1, 0, 0], [0, 0, 1])
-        for near, far in product(nears, [*fars, 500, 700, 1000]):
-            box = {"halfExtents": [0.01 * far, far, far], "physicsClientId": client}
-            shape = bullet.createVisualShape(bullet.GEOM_BOX, **box)
-            place = [0.91 * far, 0, -1.05 * far]
-            wall = bullet.createMultiBody(0, -1, shape, place, physicsClientId=client)
-            lens = bullet.computeProjectionMatrixFOV(60, 8 / 6, near, far)
-            software = {"renderer": bullet.ER_TINY_RENDERER, "physicsClientId": client}
-            *_, buffer, ids = bullet.getCameraImage(8, 6, view, lens, **software)
-            bullet.removeBody(wall, physicsClientId=client)
-            buffer, ids = (np.reshape(part, (1, 6, 8)) for part in (buffer, ids))
-            buffer = torch.as_tensor(buffer.astype("f8" if as_float64 else "f4"))
-            is_wall = torch.as_tensor(ids) == wall
-            assert is_wall.float().mean() == 0.5
-            inexact += bool((buffer[~is_wall] != 1.0).any())
-            z = adapt_depth(buffer, "z_buffer", near_m=near, far_m=far)
-            assert (z[~is_wall] == math.inf).all(), (near, far)
-            # a buffer's last digit is far / near times its spacing, 6e-8, in depth
-            within = 1e-6 * far / near + 1e-3
-            assert (z[is_wall] / (0.9 * far) - 1).abs().max() < within, (near, far)
-    finally:
-        bullet.disconnect(client)
+    inexact, view = 0, bullet.computeViewMatrix([0, 0, 0], [1, 0, 0], [0, 0, 1])
+    for near, far in product(nears, [*fars, 500, 700, 1000]):
+        half = {"halfExtents": [0.01 * far, far, far]}
+        shape = bullet.createVisualShape(bullet.GEOM_BOX, **half, **client)
+        wall = bullet.createMultiBody(0, -1, shape, [0.91 * far, 0, -1.05 * far], **client)
+        lens = bullet.computeProjectionMatrixFOV(60, 8 / 6, near, far)
+        software = {"renderer": bullet.ER_TINY_RENDERER, **client}
+        *_, buffer, ids = bullet.getCameraImage(8, 6, view, lens, **software)
+        bullet.removeBody(wall, **client)
+        buffer, ids = (np.reshape(part, (1, 6, 8)) for part in (buffer, ids))
+        buffer = torch.as_tensor(buffer.astype("f8" if as_float64 else "f4"))
+        is_wall = torch.as_tensor(ids) == wall
+        assert is_wall.float().mean() == 0.5
+        inexact += bool((buffer[~is_wall] != 1.0).any())
+        z = adapt_depth(buffer, "z_buffer", near_m=near, far_m=far)
+        assert (z[~is_wall] == math.inf).all(), (near, far)
+        # a buffer's last digit is far / near times its spacing, 6e-8, in depth
+        within = 1e-6 * far / near + 1e-3
+        assert (z[is_wall] / (0.9 * far) - 1).abs().max() < within, (near, far)
+    bullet.disconnect(**client)
     assert inexact > 10
 
 

@@ -1,9 +1,7 @@
 """Ego flow, flow of bodies and their difference: values by hand, masks, laws, mistakes."""
 
-from __future__ import annotations
-
 import math
-from itertools import product
+from functools import partial
 
 import pytest
 import torch
@@ -15,6 +13,7 @@ from tests.geometry.scenes import (
     OTHER_MOTION,
     WIDTH,
     K,
+    assert_equals_a_loop,
     depth_map,
     flow_pixel_by_pixel,
     instance_map,
@@ -133,31 +132,18 @@ def test_unknown_pixels_have_no_object_flow_and_say_so():
     assert ego[:, [1, 2, 3], [1, 2, 3]].abs().min() > 0
 
 
-def test_unknown_flow_of_a_body_is_no_object_flow():
-    # The camera slid 0.5 m right before 4 m: ego -0.5 px. What was behind it has no raw flow; its 0
-    # taken as measured would make obj +0.5.
-    motions = torch.stack([moved(x=0.5), moved(x=0.5, z=-5.0)])
-    depth, instance = torch.full((1, 1, 2), 4.0), torch.tensor([[[0, 1]]])
-    raw = rigid_flow(depth, instance, camera(), motions)
-    ego, obj, valid = factorize(raw, depth, camera(), motions[0])
-    assert raw.flow[0].tolist() == [[-0.5, 0.0]]
-    assert ego[0].tolist() == [[-0.5, -0.5]]
-    assert (obj == 0).all()
-    assert valid.tolist() == [[[True, False]]]
-
-
 # Zoomed in, sheared and shifted: no entry is that of K.
 PREV_K = torch.tensor([[12.5, 0.4, 3.3], [0.0, 7.2, 2.2], [0.0, 0.0, 1.0]], dtype=torch.float64)
 
 
 def test_another_k_in_the_previous_frame_agrees_with_brute_force():
     depth, instance = depth_map(), instance_map()
-    each = [flow_pixel_by_pixel(depth, K, motion, PREV_K) for motion in MOTIONS]
-    expected = torch.stack(each).gather(0, instance.long().expand(1, 2, -1, -1))[0]
+    expected = flow_pixel_by_pixel(depth, K, MOTIONS, PREV_K, instance)
     raw = rigid_flow(depth, instance, K, MOTIONS, prev_K=PREV_K)
     torch.testing.assert_close(raw.flow, expected, rtol=0, atol=1e-12)
     ego, obj, valid = factorize(raw, depth, K, MOTION, prev_K=PREV_K)
-    torch.testing.assert_close(ego, each[0], rtol=0, atol=1e-12)
+    expected = flow_pixel_by_pixel(depth, K, MOTION, PREV_K)
+    torch.testing.assert_close(ego, expected, rtol=0, atol=1e-12)
     assert valid.all()
     assert obj[:, instance[0] == 0].abs().max() == 0
 
@@ -198,16 +184,10 @@ def test_any_batch_equals_a_loop(function, batch):
         motions = motions[..., 0, :, :]
     if function is factorize:
         maps.insert(0, raw_flow(*batch))
-    together = function(*maps, Ks, motions, dt=0.5)
-    for part in together:
-        assert part.shape == (*batch, 1 if part.dtype == torch.bool else 2, HEIGHT, WIDTH)
-    for at in product(*map(range, batch)):
-        alone = function(*(image[at] for image in maps), Ks[at], motions[at], dt=0.5)
-        assert all(torch.equal(part[at], one) for part, one in zip(together, alone))
-    zoomed = function(*maps, Ks, motions, prev_K=PREV_K)
-    for at in product(*map(range, batch)):
-        alone = function(*(image[at] for image in maps), Ks[at], motions[at], prev_K=PREV_K)
-        assert all(torch.equal(part[at], one) for part, one in zip(zoomed, alone))
+    for options in ({"dt": 0.5}, {"prev_K": PREV_K}):
+        compute = partial(function, **options)
+        for part in assert_equals_a_loop(compute, batch, *maps, Ks, motions):
+            assert part.shape == (*batch, 1 if part.dtype == torch.bool else 2, HEIGHT, WIDTH)
     one_camera = function(*maps, K, motions)
     for part, other in zip(one_camera, function(*maps, K.expand_as(Ks), motions)):
         assert torch.equal(part, other)

@@ -1,36 +1,27 @@
 """Poses of any convention, the motions between them, and ids of any simulator as rows."""
 
-from __future__ import annotations
-
 import math
-from itertools import product
+from functools import partial
 
 import pytest
 import torch
 
 from flowrep import geometry as g
-from tests.geometry.scenes import MOTION, OTHER_MOTION, rigid
+from tests.geometry.scenes import MOTION, OTHER_MOTION, assert_equals_a_loop, rigid
 
 QUARTER_TURN = torch.pi / 2
 
 
 @pytest.mark.parametrize("points", [torch.float16, torch.float32, torch.float64])
 @pytest.mark.parametrize("transform", [torch.float32, torch.float64])
-def test_float_types_may_differ(transform, points):
-    # Seen along z at 3 m by a camera 10.25 m along x that looks along world x.
+def test_transform_points_by_hand(transform, points):
+    # Seen along z at 3 m by a camera 10.25 m along x that looks along world x. The inverse rotation
+    # would give (8.25, -3, 0.5).
     world_from_cam = torch.tensor([[0, 0, 1, 10.25], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
     points_cam = torch.tensor([[0.5, 2.0, 3.0]], dtype=points)
     points_world = g.transform_points(world_from_cam.to(transform), points_cam)
     assert points_world.dtype == torch.promote_types(transform, points)
     assert points_world.tolist() == [[13.25, -0.5, -2.0]]
-
-
-def test_transform_points_by_hand():
-    # About z by a quarter turn, x goes to y: (1, 0, 0) -> (0, 1, 0), then + (10, 20, 30).
-    a_from_b = rigid((0.0, 0.0, QUARTER_TURN), (10.0, 20.0, 30.0))
-    points_a = g.transform_points(a_from_b, torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64))
-    # The inverse rotation would give (10, 19, 30).
-    torch.testing.assert_close(points_a[0].tolist(), [10.0, 21.0, 30.0])
 
 
 def test_relative_motion_by_hand():
@@ -45,7 +36,8 @@ def test_relative_motion_by_hand():
 
 def test_invert_rigid_by_hand():
     a_from_b = rigid((0.0, 0.0, QUARTER_TURN), (10.0, 20.0, 30.0))
-    # b's x axis is a's y axis: a's origin lies at -(20, -10, 30) in b. -t alone: (-10, -20, -30).
+    # About z by a quarter turn, x goes to y: b's x axis is a's y axis, and a's origin lies at
+    # -(20, -10, 30) in b. -t alone: (-10, -20, -30).
     torch.testing.assert_close(g.invert_rigid(a_from_b)[:3, 3].tolist(), [-20.0, 10.0, -30.0])
 
 
@@ -62,13 +54,13 @@ def test_any_batch_equals_a_loop(batch):
     poses = MOTION.expand(*batch, 4, 4).clone()
     poses[..., :3, 3] += noise[..., :3, 3]
     points = torch.rand((*batch, 2, 5, 3), generator=generator, dtype=torch.float64)
-    relative = g.relative_motion(poses, OTHER_MOTION)
+
+    def functions(poses, points):
+        relative = g.relative_motion(poses, OTHER_MOTION)
+        return relative, g.invert_rigid(poses), g.transform_points(poses, points)
+
+    relative, *_ = assert_equals_a_loop(functions, batch, poses, points, atol=1e-12)
     assert relative.shape == (*batch, 4, 4)
-    for at in product(*map(range, batch)):
-        torch.testing.assert_close(relative[at], g.relative_motion(poses[at], OTHER_MOTION))
-        torch.testing.assert_close(g.invert_rigid(poses)[at], g.invert_rigid(poses[at]))
-        moved = g.transform_points(poses, points)[at]
-        torch.testing.assert_close(moved, g.transform_points(poses[at], points[at]))
 
 
 PREV, CURR = rigid((0.1, 0.2, 0.3), (400.0, -300.0, 1.2)), rigid((0.1, 0.25, 0.3), (400.8, -300, 1))
@@ -188,22 +180,18 @@ def test_a_pose_without_its_last_row():
 
 
 def test_angles_turn_left_and_look_up():
+    adapt, half = partial(g.adapt_pose, axes="x_forward_z_up"), math.sqrt(3) / 2
     pose = torch.tensor([5.0, 6.0, 7.0, math.pi / 2, math.pi / 6], dtype=torch.float64)
-    camera = g.adapt_pose(pose, layout="xyz_yaw_pitch", axes="x_forward_z_up")
-    ahead = camera @ torch.tensor([0.0, 0.0, 2.0, 1.0], dtype=torch.float64)
-    # a quarter turn to the left of x is y; 30 degrees up: 2 sin 30 = 1, not -1
-    expected = torch.tensor([5.0, 6 + math.sqrt(3), 8.0, 1.0], dtype=torch.float64)
-    torch.testing.assert_close(ahead, expected)
-    right = camera @ torch.tensor([1.0, 0.0, 0.0, 1.0], dtype=torch.float64)
-    torch.testing.assert_close(right[:3], torch.tensor([6.0, 6.0, 7.0], dtype=torch.float64))
+    # A quarter turn to the left of x is y, and right is x. 30 degrees up: ahead rises by sin 30,
+    # not -sin 30, and the picture's down leans ahead.
+    expected = [[1, 0, 0, 5], [0, 0.5, half, 6], [0, -half, 0.5, 7], [0, 0, 0, 1]]
+    camera = adapt(pose, layout="xyz_yaw_pitch")
+    torch.testing.assert_close(camera, torch.tensor(expected).double())
     aslant = torch.tensor([5.0, 6.0, 7.0, math.pi / 3, math.pi / 6], dtype=torch.float64)
-    down = g.adapt_pose(aslant, layout="xyz_yaw_pitch", axes="x_forward_z_up")[:3, 1]
-    # looking up by 30 degrees, the picture's down leans ahead: it is the up of
-    # (-cos 60 sin 30, -sin 60 sin 30, cos 30), turned over
-    half = math.sqrt(3) / 2
+    # down is the up of (-cos 60 sin 30, -sin 60 sin 30, cos 30), turned over
     expected = torch.tensor([0.25, half / 2, -half], dtype=torch.float64)
-    torch.testing.assert_close(down, expected)
-    level = g.adapt_pose(pose[:4], layout="xyz_yaw", axes="x_forward_z_up")
+    torch.testing.assert_close(adapt(aslant, layout="xyz_yaw_pitch")[:3, 1], expected)
+    level = adapt(pose[:4], layout="xyz_yaw")
     torch.testing.assert_close(level[:3, 2], torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
 
 

@@ -5,8 +5,6 @@ test can say what any frame must hold. Episodes of env e last 3 + e % 2 steps: i
 at different times.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

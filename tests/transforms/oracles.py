@@ -1,46 +1,23 @@
 """What each representation must be, worked out pixel by pixel in plain Python floats."""
 
-from __future__ import annotations
-
 import math
 
 import torch
 from torch import Tensor
 
+from tests.geometry.scenes import flow_pixel_by_pixel
 from tests.transforms.fake_env import INTRINSICS, NUM_CLASSES, frame, moment
 
-
-def flow(depth: Tensor, motions: Tensor, instance: Tensor | None = None) -> Tensor:
-    """Returns p_t - p_t' `[2, H, W]` of each pixel: there by `motions`, back through the camera."""
-    (fx, _, cx), (_, fy, cy), _ = INTRINSICS
-    height, width = depth.shape[-2:]
-    out = torch.zeros(2, height, width)
-    for j in range(height):
-        for i in range(width):
-            z = depth[0, j, i].item()
-            if math.isnan(z):
-                continue
-            motion = motions if instance is None else motions[instance[0, j, i].item()]
-            rows = motion.double().tolist()
-            far = math.isinf(z)
-            # A point at infinity is a direction: the translation does not move it.
-            x, y, w = ((i + 0.5 - cx) / fx, (j + 0.5 - cy) / fy, 1.0)
-            scale, moved = (1.0, 0.0) if far else (z, 1.0)
-            px, py, pz = (
-                sum(row[k] * scale * (x, y, w)[k] for k in range(3)) + moved * row[3]
-                for row in rows[:3]
-            )
-            out[0, j, i] = (i + 0.5) - (fx * px / pz + cx)
-            out[1, j, i] = (j + 0.5) - (fy * py / pz + cy)
-    return out
+K = torch.tensor(INTRINSICS, dtype=torch.float64)
 
 
 def raw(sensor: dict[str, Tensor]) -> Tensor:
-    return flow(sensor["depth"], sensor["instance_motion"], sensor["instance"])
+    motions, instance = sensor["instance_motion"], sensor["instance"]
+    return flow_pixel_by_pixel(sensor["depth"], K, motions, instance=instance).float()
 
 
 def ego(sensor: dict[str, Tensor]) -> Tensor:
-    return flow(sensor["depth"], sensor["prev_from_curr"])
+    return flow_pixel_by_pixel(sensor["depth"], K, sensor["prev_from_curr"]).float()
 
 
 def obj(sensor: dict[str, Tensor]) -> Tensor:
@@ -80,9 +57,9 @@ def ray_length_to_z(sensor: dict[str, Tensor]) -> Tensor:
     return out
 
 
-def opengl_pose(sensor: dict[str, Tensor]) -> Tensor:
-    """Returns the pose with OpenCV's axes, were the env's pose one with OpenGL's."""
-    return sensor["world_from_cam"] * torch.tensor([1, -1, -1, 1])
+def inverted_opengl_pose(sensor: dict[str, Tensor]) -> Tensor:
+    """Returns the pose with OpenCV's axes, were the env's pose world-to-camera with OpenGL's."""
+    return torch.linalg.inv(sensor["world_from_cam"]) * torch.tensor([1, -1, -1, 1])
 
 
 def rows_backward(sensor: dict[str, Tensor]) -> Tensor:

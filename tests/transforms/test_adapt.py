@@ -1,7 +1,5 @@
 """Adapters as transforms: what they hand to geometry, and what they refuse."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -34,18 +32,6 @@ def test_intrinsics_of_each_sample_may_lie_under_a_key():
     td = TensorDict({"ray": torch.full((2, 1, 1, 6), 5.0), "K": K}, [2])
     z = T.AdaptDepth("ray_length", intrinsics="K", in_keys="ray")(td)["sensor", "depth"]
     torch.testing.assert_close(z[:, 0, 0, 5], torch.tensor([5.0 / math.sqrt(2), 4.0]))
-
-
-def test_poses_of_several_bodies_at_once():
-    poses = torch.zeros(2, 3, 7)
-    poses[..., 3] = 1.0
-    poses[1, 2, :3] = torch.tensor([1.0, 2.0, 3.0])
-    adapt = T.AdaptPose(layout="xyz_wxyz", in_keys="bodies", out_keys="matrices")
-    matrices = adapt(TensorDict({"bodies": poses}, [2]))["matrices"]
-    assert matrices.shape == (2, 3, 4, 4)
-    assert matrices[1, 2, :3, 3].tolist() == [1.0, 2.0, 3.0]
-    with pytest.raises(ValueError, match=r"float \[\*B, 7\].*\[2, 3, 4, 4\]"):
-        T.AdaptPose(layout="xyz_wxyz", in_keys="matrices")(TensorDict({"matrices": matrices}, [2]))
 
 
 @pytest.mark.parametrize("layout", ["matrix", "xyz_wxyz"])

@@ -1,7 +1,5 @@
 """Every transform computes in one graph for any batch, on any device, and never waits for a GPU."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -9,85 +7,46 @@ from torch._dynamo.testing import CompileCounter
 from torchrl.envs.transforms import Compose
 
 from flowrep import transforms as T
-from tests.transforms.fake_env import INTRINSICS, NUM_CLASSES, moments
+from tests.transforms.fake_env import moments
+from tests.transforms.test_contract import CASES as CONTRACT
+from tests.transforms.test_contract import Case
 
-KEY, POSE = ("sensor", "K"), ("sensor", "world_from_cam")
-POSES = "world_from_cam", "world_from_body"
-
-
-def camera_step(before: torch.Tensor, now: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    return T.CameraMotion().advance([before], [now])
-
-
-def bodies_step(*poses: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    return T.InstanceMotion().advance(poses[:2], poses[2:])
-
-
-def next_stack(stack: torch.Tensor, frame: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    return T.FrameStack(k=3, in_keys=["x"], out_keys=["x3"]).advance([stack], [frame])
-
-
+KEY = ("sensor", "K")
 NOISE = {"depth_sigma_per_m": 0.1, "depth_dropout": 0.2, "drift_m": 0.1, "drift_rad": 0.2}
-TRANSFORMS = {
-    "onehot": lambda: T.Segmentation(NUM_CLASSES, encoding="onehot"),
-    "depth": T.Depth,
-    "K under a key": lambda: T.RawFlow(
-        KEY, prev_intrinsics=KEY, scale=0.5, outputs=["raw", "valid"]
-    ),
-    "ego, obj": lambda: T.FlowFactorize(INTRINSICS, scale=10.0),
-    "ray length": lambda: T.AdaptDepth(
-        "ray_length", intrinsics=INTRINSICS, in_keys=("sensor", "depth"), out_keys="z"
-    ),
-    "pose": lambda: T.AdaptPose(
-        direction="world_to_camera", axes="ned", in_keys=POSE, out_keys="world_from_cam"
-    ),
-    "flow": lambda: T.AdaptFlow(
-        direction="backward", grid="current", channels="row_column", in_keys="raw", out_keys="own"
-    ),
-    "ids": lambda: T.InstanceIds([3, 1], in_keys=("sensor", "semantic")),
-    "noise by frame": lambda: T.SensorNoise(**NOISE, frame_key="frame"),
-}
-# What runs once a step beside `compute`, with its maps of two moments.
-STEPS = {
-    "camera step": lambda td: (camera_step, [td[POSE].flip(0), td[POSE]]),
-    "bodies step": lambda td: (
-        bodies_step,
-        [sensor[key] for sensor in (td["sensor"].flip(0), td["sensor"]) for key in POSES],
-    ),
-    "next stack": lambda td: (
-        next_stack,
-        [td["sensor", "rgb"].repeat(1, 3, 1, 1), td["sensor", "rgb"]],
-    ),
-}
-
-
-def inputs(transform, td):
-    return [td[key] for key in transform.in_keys]
-
-
-def of(make):
-    return lambda td: ((transform := make()).compute, inputs(transform, td))
-
-
-# Functions from a batch of moments to (a function, its tensors).
-CASES = {name: of(make) for name, make in TRANSFORMS.items()} | STEPS
+NAMES = [
+    *("Segmentation, onehot", "Depth", "RawFlow", "FlowFactorize", "AdaptDepth", "AdaptPose"),
+    *("AdaptFlow", "InstanceIds", "FrameStack", "CameraMotion", "InstanceMotion"),
+]
+CASES = {name: CONTRACT[name] for name in NAMES}
+CASES["noise by frame"] = Case(lambda: T.SensorNoise(**NOISE, frame_key="frame"), {})
 each_case = pytest.mark.parametrize("case", CASES.values(), ids=list(CASES))
 
 
-def framed(count: int):
-    """Moments with names of frames: numbers of episodes and steps."""
-    return moments(count).set("frame", torch.arange(2 * count).reshape(-1, 2))
+def of(case, count):
+    """Returns what runs once a step, `compute` or `advance`, and its tensors of some moments."""
+    td = moments(count).set("frame", torch.arange(2 * count).reshape(-1, 2))
+    transform, td = case.make(), Compose(*case.before())(td)
+    now = [td[key] for key in transform.in_keys]
+    if not case.carries:
+        return transform.compute, now
+    known = dict(zip([*transform.in_keys, *transform.out_keys], [*now, *transform.compute(*now)]))
+    before = [known[key].flip(0) for key in transform.carried_keys]
+
+    def advance(*maps):
+        return transform.advance(maps[: len(before)], maps[len(before) :])
+
+    return advance, [*before, *now]
 
 
 @pytest.mark.slow_after_first
 @each_case
 def test_one_graph_for_all_batches(case):
     torch._dynamo.reset()
-    function, _ = case(framed(11))
+    function, _ = of(case, 11)
     counter = CompileCounter()  # counts graphs, and runs them eagerly
     compiled = torch.compile(function, fullgraph=True, dynamic=True, backend=counter)
     for batch in (11, 2):  # first one that equals no other size: torch would tie the two
-        _, given = case(framed(batch))
+        _, given = of(case, batch)
         for got, want in zip(compiled(*given), function(*given)):
             assert torch.equal(got.nan_to_num(), want.nan_to_num())
     assert counter.frame_count == 1
@@ -97,51 +56,40 @@ def test_one_graph_for_all_batches(case):
 SENSORS = ["depth", "instance", "instance_motion", "prev_from_curr", "K"]
 
 
+CAMERA = {"intrinsics": KEY, "prev_intrinsics": KEY}
+
+
 class Wrapped(torch.nn.Module):
     """Takes tensors, as a program that is exported has to."""
 
-    def __init__(self, transform):
+    def __init__(self, make, writes):
         super().__init__()
-        self.transform = transform
+        self.transform, self.writes = make(), writes
 
     def forward(self, *sensors):
         td = self.transform(TensorDict({"sensor": dict(zip(SENSORS, sensors))}, [3]))
-        return td["raw"], td["obj"]
+        return tuple(td[key] for key in self.writes)
 
 
-def test_a_stack_is_compiled_and_exported_and_runs_on_meta_tensors():
-    camera = {"intrinsics": KEY, "prev_intrinsics": KEY}
-    given = tuple(moments(3)["sensor", name] for name in SENSORS)
-    used = Wrapped(Compose(T.RawFlow(**camera), T.FlowFactorize(**camera)))
-    want = used(*given)
+@pytest.mark.parametrize(
+    "stack",
+    [
+        (lambda: Compose(T.RawFlow(**CAMERA), T.FlowFactorize(**CAMERA)), ["raw", "obj"]),
+        # noise that is drawn anew at each call
+        (lambda: T.SensorNoise(**NOISE, seed=1, out_keys=["z", "motion"]), ["z", "motion"]),
+    ],
+    ids=["flow", "noise"],
+)
+def test_a_stack_is_compiled_and_exported_and_runs_on_meta_tensors(stack):
     torch.compiler.reset()
-    compiled = torch.compile(used, fullgraph=True, backend="eager")
-    for run in (compiled, torch.export.export(used, given).module()):
-        for got, expected in zip(run(*given), want):
-            assert torch.equal(got, expected)
-    assert all(each.is_meta for each in used.to("meta")(*(x.to("meta") for x in given)))
-
-
-class Noisy(torch.nn.Module):
-    """Draws new noise at each call."""
-
-    def __init__(self):
-        super().__init__()
-        self.noise = T.SensorNoise(**NOISE, seed=1)
-
-    def forward(self, *maps):
-        return self.noise.compute(*maps)
-
-
-def test_noise_that_is_drawn_anew_is_compiled_and_exported_and_runs_on_meta_tensors():
-    eager, given = Noisy(), tuple(inputs(T.SensorNoise(), moments(3)))
-    compiled = torch.compile(Noisy(), fullgraph=True, backend="eager")
-    exported = torch.export.export(Noisy(), given).module()
+    eager, given = Wrapped(*stack), tuple(moments(3)["sensor", name] for name in SENSORS)
+    compiled = torch.compile(Wrapped(*stack), fullgraph=True, backend="eager")
+    exported = torch.export.export(Wrapped(*stack), given).module()
     for _ in range(3):
         want = eager(*given)
         for run in (compiled, exported):
             torch.testing.assert_close(run(*given), want, rtol=0, atol=0, equal_nan=True)
-    assert all(each.is_meta for each in Noisy().to("meta")(*(x.to("meta") for x in given)))
+    assert all(each.is_meta for each in eager.to("meta")(*(x.to("meta") for x in given)))
 
 
 CHECKED = {
@@ -167,10 +115,10 @@ def test_compiled_code_refuses_class_ids_that_would_wrap_too():
 
 def on(device, case):
     """Returns a case's function and tensors on a device."""
-    function, given = case(framed(3).to(device))
+    function, given = of(case, 3)
     if (owner := getattr(function, "__self__", None)) is not None:
         owner.to(device)
-    return function, given
+    return function, [each.to(device) for each in given]
 
 
 @each_case
@@ -199,11 +147,11 @@ def test_a_gpu_gives_what_the_cpu_gives_without_waiting(case):
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_noise_is_drawn_on_the_gpu_without_waiting():
     noise = T.SensorNoise(**NOISE)
-    td = moments(3).to("cuda")
-    noise.compute(*inputs(noise, td))
+    given = [moments(3)[key].to("cuda") for key in noise.in_keys]
+    noise.compute(*given)
     torch.cuda.set_sync_debug_mode("error")
     try:
-        depth, motion = noise.compute(*inputs(noise, td))
+        depth, motion = noise.compute(*given)
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert depth.is_cuda

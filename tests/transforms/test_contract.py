@@ -3,8 +3,6 @@
 What each output must be is worked out pixel by pixel in `oracles`, from the frame's moment alone.
 """
 
-from __future__ import annotations
-
 import copy
 import functools
 import pickle
@@ -29,7 +27,10 @@ STEPS = 5  # the shortest episode has 3: a rollout crosses resets
 
 # From one frame's sensor maps to what an output must be.
 Oracle = Callable[[dict[str, Tensor]], Tensor]
-POSE = ("sensor", "world_from_cam")
+KEY, POSE = ("sensor", "K"), ("sensor", "world_from_cam")
+PICTURES, FACTORS = [("sensor", "rgb"), ("sensor", "semantic")], ["ego", "obj", "raw", "valid"]
+BACKWARD = {"direction": "backward", "grid": "current", "channels": "row_column"}
+INVERTED = {"direction": "world_to_camera", "axes": "opengl"}
 
 
 class Case(NamedTuple):
@@ -74,24 +75,18 @@ CASES = {
     ),
     "Rgb": Case(T.Rgb, {"rgb": the_same("rgb")}),
     "RawFlow": Case(
-        lambda: T.RawFlow(INTRINSICS, outputs=["raw", "valid"], out_keys=["raw", "known"]),
-        {"raw": oracles.raw, "known": oracles.valid},
+        lambda: T.RawFlow(
+            KEY, prev_intrinsics=KEY, outputs=["raw", "valid"], out_keys=[("own", "raw"), "known"]
+        ),
+        {("own", "raw"): oracles.raw, ("own", "raw_valid"): oracles.valid, "known": oracles.valid},
     ),
     "FlowFactorize": Case(
-        lambda: T.FlowFactorize(
-            INTRINSICS,
-            outputs=["ego", "obj", "raw", "valid"],
-            out_keys=["ego", "obj", "raw2", "valid"],
-        ),
-        {"ego": oracles.ego, "obj": oracles.obj, "raw2": oracles.raw, "valid": oracles.valid},
+        lambda: T.FlowFactorize(INTRINSICS, outputs=FACTORS, out_keys=["a", "b", "c", "d"]),
+        {"a": oracles.ego, "b": oracles.obj, "c": oracles.raw, "d": oracles.valid},
         before=raw_flow,
     ),
     "FrameStack": Case(
-        lambda: T.FrameStack(
-            k=3,
-            in_keys=[("sensor", "rgb"), ("sensor", "semantic")],
-            out_keys=[("stack", "rgb"), ("stack", "ids")],
-        ),
+        lambda: T.FrameStack(k=3, in_keys=PICTURES, out_keys=[("stack", "rgb"), ("stack", "ids")]),
         {("stack", "rgb"): stacked("rgb", 3), ("stack", "ids"): stacked("semantic", 3)},
         carries=True,
     ),
@@ -107,17 +102,11 @@ CASES = {
         {"z": oracles.ray_length_to_z},
     ),
     "AdaptPose": Case(
-        lambda: T.AdaptPose(axes="opengl", in_keys=POSE, out_keys=("adapted", "pose")),
-        {("adapted", "pose"): oracles.opengl_pose},
+        lambda: T.AdaptPose(**INVERTED, in_keys=POSE, out_keys=("adapted", "pose")),
+        {("adapted", "pose"): oracles.inverted_opengl_pose},
     ),
     "AdaptFlow": Case(
-        lambda: T.AdaptFlow(
-            direction="backward",
-            grid="current",
-            channels="row_column",
-            in_keys="raw",
-            out_keys="measured",
-        ),
+        lambda: T.AdaptFlow(**BACKWARD, in_keys="raw", out_keys="measured"),
         {"measured": oracles.rows_backward},
         before=raw_flow,
     ),

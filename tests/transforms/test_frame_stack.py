@@ -4,8 +4,6 @@
 env 1 have 4, so that in a batch one env starts anew while the other goes on.
 """
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict

@@ -1,7 +1,5 @@
 """Mirror: left-right images of transitions, worked out by hand."""
 
-from __future__ import annotations
-
 import pickle
 
 import pytest
@@ -64,17 +62,9 @@ def test_any_batch_has_its_image(batch):
     td = transitions(*batch)
     assert same(mirror()(td.clone()), image(td))
     assert same(Compose(mirror())(td.clone()), image(td))
-
-
-def test_images_of_maps_alone_are_those_of_transitions():
-    td = transitions(3)
-    assert all(
-        map(
-            torch.equal,
-            mirror().images_of([td["raw"], td["seg"]]),
-            [image(td)[k] for k in ("raw", "seg")],
-        )
-    )
+    raw, seg = mirror().images_of([td["raw"], td["seg"]])  # of maps alone
+    assert torch.equal(raw, image(td)["raw"])
+    assert torch.equal(seg, image(td)["seg"])
 
 
 def test_a_replay_buffer_stores_what_was_seen_and_samples_images():
@@ -125,29 +115,18 @@ def test_ego_flow_of_the_image_is_the_image_of_ego_flow():
     torch.testing.assert_close(there[..., :-1], seen["ego"][..., :-1], atol=1e-5, rtol=1e-5)
 
 
-def test_one_hot_actions_and_actions_of_their_own_dim_are_exchanged():
+def test_actions_in_any_layout_and_their_masks_are_exchanged_and_continuous_ones_refused():
     td = transitions(3)
-    td["action"] = torch.tensor([0, 1, 2])
-    one_hot = td.clone().set("action", torch.eye(3, dtype=torch.bool))
-    column = td.clone().set("action", td["action"][:, None])
-    assert mirror()(one_hot)["action"].int().argmax(-1).tolist() == [0, 2, 1]
-    assert mirror()(column)["action"].tolist() == [[0], [2], [1]]
-
-
-def test_masks_of_actions_are_exchanged_with_them():
-    td = transitions(1)
-    td["action"] = torch.tensor([1])
-    td["action_mask"] = torch.tensor([[True, True, False]])
-    td["next", "action_mask"] = torch.tensor([[False, False, True]])
-    image = mirror()(td)
-    assert image["action_mask"].tolist() == [[True, False, True]]
-    assert image["next", "action_mask"].tolist() == [[False, True, False]]
-    assert image["action"].tolist() == [2]
-
-
-def test_continuous_actions_are_refused():
-    td = transitions(2)
-    td["action"] = torch.tensor([[0.7], [-0.4]])
+    td["action_mask"] = torch.tensor([[True, True, False]]).expand(3, 3)
+    td["next", "action_mask"] = torch.tensor([[False, False, True]]).expand(3, 3)
+    one_hot = mirror()(td.clone().set("action", torch.eye(3, dtype=torch.bool)))
+    column = mirror()(td.clone().set("action", torch.tensor([[0], [1], [2]])))
+    assert one_hot["action"].int().argmax(-1).tolist() == [0, 2, 1]
+    assert column["action"].tolist() == [[0], [2], [1]]
+    for image in (one_hot, column):
+        assert image["action_mask"].tolist() == [[True, False, True]] * 3
+        assert image["next", "action_mask"].tolist() == [[False, True, False]] * 3
+    td["action"] = torch.tensor([[0.7], [-0.4], [0.1]])
     with pytest.raises(TypeError, match=r"discrete actions, got torch\.float32"):
         mirror()(td)
 
@@ -192,13 +171,7 @@ def test_a_batch_may_lack_the_next_maps_but_not_its_own():
 def test_a_picture_of_another_width_than_the_camera_s_maps_is_refused():
     K = [[40.0, 0.0, 20.0], [0.0, 40.0, 20.0], [0.0, 0.0, 1.0]]
     mirror = Mirror(["seg", "rgb"], swapped_actions=SWAPPED, intrinsics=K)
-    td = TensorDict(
-        {
-            "seg": torch.zeros(4, 1, 40, 40),
-            "rgb": torch.zeros(4, 3, 160, 160),  # as drawn for estimated flow
-            "action": torch.zeros(4, dtype=torch.long),
-        },
-        [4],
-    )
+    td = TensorDict({"seg": torch.zeros(4, 1, 40, 40), "action": torch.zeros(4).long()}, [4])
+    td["rgb"] = torch.zeros(4, 3, 160, 160)  # as drawn for estimated flow
     with pytest.raises(ValueError, match=r"'rgb' is 160 pixels wide, but 2·cx is 40"):
         mirror(td)

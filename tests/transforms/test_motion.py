@@ -1,7 +1,5 @@
 """Poses to motions: nothing moves at a reset, whoever resets; nothing is remembered."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -9,36 +7,22 @@ from torchrl.data import Bounded, Unbounded
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
-from flowrep.transforms import (
-    AdaptPose,
-    CameraMotion,
-    EstimateCameraMotion,
-    FlowFactorize,
-    InstanceIds,
-    InstanceMotion,
-    RawFlow,
-)
+from flowrep import transforms as T
 from flowrep.transforms.base import IDS, RecurrentTransform
 from tests.transforms.fake_env import INTRINSICS, FakeSensorEnv, frame_motions, moments
 
-MOTION = "motion"
-
-
-def camera_motion() -> CameraMotion:
-    return CameraMotion(out_keys=[MOTION])
-
 
 def test_a_step_from_an_earlier_tensordict_moves_from_its_pose():
-    env = TransformedEnv(FakeSensorEnv((2,)), camera_motion())
+    env = TransformedEnv(FakeSensorEnv((2,)), T.CameraMotion(out_keys="motion"))
     action = torch.zeros(2, dtype=torch.long)
     first = env.reset().set("action", action)
     second = step_mdp(env.step(first.clone())).set("action", action)
     env.step(second)
     again = env.step(first.clone())  # the env itself has gone on: from pose 0 to pose 3
-    turned = [again["next", MOTION][i, :3, :3].trace().item() for i in (0, 1)]
-    once = [second[MOTION][i, :3, :3].trace().item() for i in (0, 1)]
-    assert all(far < near - 1e-4 for far, near in zip(turned, once))
-    assert not camera_motion().state_dict()
+    turned, once = again["next", "motion"], second["motion"]
+    for i in (0, 1):
+        assert turned[i, :3, :3].trace() < once[i, :3, :3].trace() - 1e-4
+    assert not T.CameraMotion().state_dict()
 
 
 class Brightness(RecurrentTransform):
@@ -75,8 +59,8 @@ def test_a_state_may_be_of_another_type_and_ids_of_any(carried, make):
 
 def test_two_cameras_that_share_a_pose_s_key_are_refused():
     def camera():
-        adapt = AdaptPose(in_keys=("sensor", "world_from_cam"), out_keys="pose")
-        return Compose(adapt, CameraMotion(in_keys="pose"))
+        adapt = T.AdaptPose(in_keys=("sensor", "world_from_cam"), out_keys="pose")
+        return Compose(adapt, T.CameraMotion(in_keys="pose"))
 
     TransformedEnv(FakeSensorEnv(), camera()).rollout(2)
     with pytest.raises(ValueError, match="AdaptPose writes to 'pose', which CameraMotion"):
@@ -86,7 +70,7 @@ def test_two_cameras_that_share_a_pose_s_key_are_refused():
 def test_two_cameras_that_share_a_motion_s_key_are_refused_in_a_batch():
     td = FakeSensorEnv().rollout(2)
     poses = [("sensor", "world_from_cam"), "other"]  # which isn't needed to see it
-    cameras = Compose(*(CameraMotion(in_keys=key, out_keys=MOTION) for key in poses))
+    cameras = Compose(*(T.CameraMotion(in_keys=key, out_keys="motion") for key in poses))
     with pytest.raises(ValueError, match="earlier transform write 'motion'"):
         cameras(td)
 
@@ -103,18 +87,17 @@ class WithRows(FakeSensorEnv):
         self.observation_spec["sensor"] = spec
 
     def _observe(self):
-        seen, static = super()._observe(), torch.eye(4).double()[None]
+        seen = super()._observe()
         if self.static_row:
-            seen["sensor", "world_from_body"] = torch.cat(
-                [static, seen["sensor", "world_from_body"]]
-            )
+            rows = [torch.eye(4).double()[None], seen["sensor", "world_from_body"]]
+            seen["sensor", "world_from_body"] = torch.cat(rows)
         return seen
 
 
 def test_no_body_gets_its_neighbours_motion():
     def flow(**options):
         keys = [("sensor", "depth"), ("sensor", "instance"), "motions"]
-        stack = Compose(InstanceMotion(out_keys="motions"), RawFlow(INTRINSICS, in_keys=keys))
+        stack = Compose(T.InstanceMotion(out_keys="motions"), T.RawFlow(INTRINSICS, in_keys=keys))
         return TransformedEnv(WithRows(**options), stack).rollout(1)["next", "raw"]
 
     shape = (1, 5, 7)
@@ -129,8 +112,8 @@ def test_no_body_gets_its_neighbours_motion():
 
 def test_bodies_of_a_batch_are_counted_if_instance_ids_is_beside_the_flow():
     def flow(*bodies):
-        td, ids = moments(2), InstanceIds(bodies, static_ids=[0, 2], in_keys="ids")
-        return Compose(ids, RawFlow(INTRINSICS))(td.set("ids", td["sensor", "instance"]))["raw"]
+        td, ids = moments(2), T.InstanceIds(bodies, static_ids=[0, 2], in_keys="ids")
+        return Compose(ids, T.RawFlow(INTRINSICS))(td.set("ids", td["sensor", "instance"]))["raw"]
 
     assert flow(1, 2).any()
     with pytest.raises(ValueError, match=r"ids from 0 to 1.*3 rows.*1 \+ N"):
@@ -139,9 +122,9 @@ def test_bodies_of_a_batch_are_counted_if_instance_ids_is_beside_the_flow():
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 def test_autocast_rounds_no_motion(dtype):
-    td = Compose(RawFlow(WIDE), EstimateCameraMotion(WIDE))(wide_frames())
+    td = Compose(T.RawFlow(WIDE), T.EstimateCameraMotion(WIDE))(wide_frames())
     with torch.autocast("cpu", dtype=dtype):
-        other = Compose(RawFlow(WIDE), EstimateCameraMotion(WIDE))(wide_frames())
+        other = Compose(T.RawFlow(WIDE), T.EstimateCameraMotion(WIDE))(wide_frames())
     assert torch.equal(other["sensor", "prev_from_curr"], td["sensor", "prev_from_curr"])
 
 
@@ -164,8 +147,8 @@ def test_flow_and_depth_tell_ego_and_object_flow_without_a_pose():
     td = wide_frames()
     exact = td.clone()
     exact["sensor", "prev_from_curr"] = exact["truth"]
-    Compose(RawFlow(WIDE), FlowFactorize(WIDE))(exact)
-    estimated = Compose(RawFlow(WIDE), EstimateCameraMotion(WIDE), FlowFactorize(WIDE))(td)
+    Compose(T.RawFlow(WIDE), T.FlowFactorize(WIDE))(exact)
+    estimated = Compose(T.RawFlow(WIDE), T.EstimateCameraMotion(WIDE), T.FlowFactorize(WIDE))(td)
     for key in (("sensor", "prev_from_curr"), "ego", "obj"):
         torch.testing.assert_close(estimated[key], exact[key], rtol=0, atol=1e-4)
     assert estimated["sensor", "motion_valid"].all()
@@ -175,17 +158,17 @@ def test_flow_and_depth_tell_ego_and_object_flow_without_a_pose():
 
 
 def test_pixels_of_unknown_raw_flow_tell_nothing_of_the_motion():
-    td = RawFlow(WIDE)(wide_frames())
+    td = T.RawFlow(WIDE)(wide_frames())
     td["raw"][..., :14], td["raw_valid"][..., :14] = 0.0, False  # most of the picture
-    motion = EstimateCameraMotion(WIDE, outputs=["motion"])(td)["sensor", "prev_from_curr"]
+    motion = T.EstimateCameraMotion(WIDE, outputs=["motion"])(td)["sensor", "prev_from_curr"]
     torch.testing.assert_close(motion, td["truth"], rtol=0, atol=1e-4)
 
 
 def test_an_estimate_reads_the_picture_the_prior_and_k_where_it_is_told():
-    td = RawFlow(WIDE)(wide_frames())
+    td = T.RawFlow(WIDE)(wide_frames())
     td["sensor", "rgb"] = torch.full((3, 3, 16, 24), 9, dtype=torch.uint8)
     td["odometry"], td["K"] = td["truth"].clone(), torch.tensor(WIDE).expand(3, 3, 3)
-    estimate = EstimateCameraMotion(
+    estimate = T.EstimateCameraMotion(
         "K", prev_intrinsics="K", picture=("sensor", "rgb"), prior="odometry"
     )
     assert estimate.in_keys == ["raw", ("sensor", "depth"), ("sensor", "rgb"), "odometry", "K"]

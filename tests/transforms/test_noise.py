@@ -1,7 +1,5 @@
 """Sensor noise: its size, its independence, and frames that keep theirs."""
 
-from __future__ import annotations
-
 import copy
 import functools
 import itertools

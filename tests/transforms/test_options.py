@@ -8,6 +8,7 @@ import torch
 
 from flowrep import transforms as T
 from tests.transforms.fake_env import INTRINSICS
+from tests.transforms.oracles import brightening
 
 SWAPPED = [0, 2, 1]
 SKEWED = [[6.0, 0.1, 3.0], [0.0, 5.0, 2.1], [0.0, 0.0, 1.0]]
@@ -54,6 +55,27 @@ MISTAKES = {
     r"scale must be a finite number other than 0": lambda: factorize(scale=0.0),
     r"^scale needs one value for each of \['ego', 'obj'\]": lambda: factorize(scale={"ego": 1.0}),
     r"K, \[3, 3\], or the key of .*; got \[4, 4\]": lambda: T.FlowFactorize(torch.eye(4)),
+    r"\['dis', 'raft_small', 'raft_large'\].*'farneback'": lambda: T.EstimatedFlow("farneback"),
+    r"'raft_small'.*weights=": lambda: T.EstimatedFlow("raft_small"),
+    r"weights=.*'dis'": lambda: T.EstimatedFlow(weights="w.pth"),
+    r"preset must be one of .*'fine'\], got 'slow'": lambda: T.EstimatedFlow(preset="slow"),
+    r"min_side_px.* 0": lambda: T.EstimatedFlow(min_side_px=0),
+    r"min_side_px.* 95\.5": lambda: T.EstimatedFlow(min_side_px=95.5),
+    r"picture_scale.* 0": lambda: T.EstimatedFlow(brightening, picture_scale=0),
+    r"picture_scale.* 1\.5": lambda: T.EstimatedFlow(brightening, picture_scale=1.5),
+    r"preset='slow'.*function": lambda: T.EstimatedFlow(brightening, preset="slow"),
+    r"min_side_px=96.*DIS\(": lambda: T.EstimatedFlow(brightening, min_side_px=96),
+    r"scale=2\.0.*unscaled": lambda: T.EstimatedFlow(outputs=["unscaled"], scale=2.0),
+    r"some of \['raw', 'unscaled'\]": lambda: T.EstimatedFlow(outputs=["valid"]),
+    # A simulator's conventions
+    r"isaac_lab": lambda: T.sensors_from("isaac"),
+    r"forward_depth": lambda: T.sensors_from("newton", depth="z"),
+    r"needs far_m=": lambda: T.sensors_from("mujoco"),
+    r"doesn't read far_m=": lambda: T.sensors_from("maniskill", far_m=9.0),
+    r"needs intrinsics=": lambda: T.sensors_from("kubric"),
+    r"has no flow": lambda: T.sensors_from("carla", flow=True),
+    r"static_ids needs body_ids": lambda: T.sensors_from("carla", static_ids=[7]),
+    r"keys= names .*depth": lambda: T.sensors_from("newton", keys={"depth": "z"}),
     # A list of representations, whose options are checked whether or not they are used
     r"unknown representation 'eggo'.*'depth2'": lambda: stack(["eggo"]),
     r"'ego' is named twice": lambda: stack(["ego", "obj", "ego"]),

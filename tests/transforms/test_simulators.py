@@ -5,8 +5,7 @@ themselves. `truth` computes flow from points, in numpy; each writer turns the s
 simulator's buffers, with scipy's rotations. None of flowrep's code is asked for either.
 """
 
-from __future__ import annotations
-
+import functools
 import importlib.util
 import math
 import re
@@ -17,12 +16,13 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from tensordict import TensorDict
-from torchrl.data import Categorical, Composite, Unbounded
-from torchrl.envs import Compose, EnvBase, TransformedEnv, check_env_specs
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import Compose, TransformedEnv, check_env_specs
 
 from flowrep import diagnose
 from flowrep.transforms import CONVENTIONS, FlowFactorize, RawFlow, sensors_from
 from tests.running import ENVIRONMENT, run_python
+from tests.transforms.fake_env import FakeSensorEnv
 
 STEPS, HEIGHT, WIDTH = 4, 5, 7
 K = np.array([[6.0, 0.0, 3.2], [0.0, 5.0, 2.1], [0.0, 0.0, 1.0]])
@@ -94,19 +94,22 @@ def seven(pose, quaternion):
     return np.concatenate([pose[..., :3, 3], quaternion(pose)], -1).astype(np.float32)
 
 
+def apart(position, rotation, pose, quaternion=wxyz):
+    """Position and quaternion under a key each."""
+    return {position: pose[..., :3, 3], rotation: quaternion(pose).astype(pose.dtype)}
+
+
 def names(body, background):
     return np.array([*IDS, background])[body]  # -1 is the last
 
 
-def isaac_lab(t, quaternion=xyzw):
-    z, body, camera, bodies = scene(t)
-    u, v = np.moveaxis(truth(t) if t else np.zeros((HEIGHT, WIDTH, 2)), -1, 0)
+def isaac_lab(z, body, camera, bodies, flow, quaternion=xyzw):
+    u, v = flow
     ids = names(body, 1)[..., None].astype(np.int32)
     return {
         "distance_to_image_plane": z[..., None].astype(np.float32),
         "distance_to_camera": ray_lengths(z)[..., None].astype(np.float32),
-        "pos_w": camera[:3, 3].astype(np.float32),
-        "quat_w_ros": quaternion(camera).astype(np.float32),  # ROS's camera is OpenCV's
+        **apart("pos_w", "quat_w_ros", camera.astype(np.float32), quaternion),  # ROS's is OpenCV's
         "body_link_pose_w": seven(bodies, quaternion),
         "instance_segmentation": ids,  # 3.0's
         "instance_id_segmentation_fast": ids,  # 2.x's
@@ -115,8 +118,7 @@ def isaac_lab(t, quaternion=xyzw):
     }
 
 
-def maniskill(t):
-    z, body, camera, bodies = scene(t)
+def maniskill(z, body, camera, bodies, _):
     return {
         "depth": np.round(1000 * sky_is(0, z))[..., None].astype(np.int16),
         "cam2world_gl": (camera @ GL_FROM_CV).astype(np.float32),
@@ -125,28 +127,24 @@ def maniskill(t):
     }
 
 
-def mujoco(t):
-    z, body, camera, bodies = scene(t)
+def mujoco(z, body, camera, bodies, _):
     geom = 5  # mjOBJ_GEOM
     segmentation = np.stack([names(body, -1), np.where(body < 0, -1, geom)], -1)
     return {
         "depth": sky_is(FAR_M * 0.9997, z),  # as float32 leaves it
         "camera_pose": camera @ GL_FROM_CV,
-        "xpos": bodies[:, :3, 3],
-        "xquat": wxyz(bodies),
+        **apart("xpos", "xquat", bodies),
         "segmentation": segmentation.astype(np.int32),
     }
 
 
-def mjlab(t):
-    z = scene(t)[0]
-    buffers = {name: np.float32(value) for name, value in mujoco(t).items()}
+def mjlab(z, *others):
+    buffers = {name: np.float32(value) for name, value in mujoco(z, *others).items()}
     buffers["segmentation"] = buffers["segmentation"].astype(np.int32)
     return buffers | {"depth": sky_is(0, z)[..., None]}
 
 
-def newton(t):
-    z, body, camera, bodies = scene(t)
+def newton(z, body, camera, bodies, _):
     return {
         "forward_depth": sky_is(0, z),
         "depth": sky_is(0, ray_lengths(z)),
@@ -156,42 +154,33 @@ def newton(t):
     }
 
 
-def genesis(t):
-    z, body, camera, bodies = scene(t)
+def genesis(z, body, camera, bodies, _):
     return {
         "depth": sky_is(FAR_M, z),
         "transform": camera @ GL_FROM_CV,
-        "links_pos": bodies[:, :3, 3].astype(np.float32),
-        "links_quat": wxyz(bodies).astype(np.float32),
+        **apart("links_pos", "links_quat", bodies.astype(np.float32)),
         "segmentation": names(body, 0).astype(np.int32),
     }
 
 
-def habitat(t):
-    z, body, camera, bodies = scene(t)
+def habitat(z, body, camera, bodies, _):
     y_up = rigid((-90, 0, 0), (0, 0, 0))
     camera, bodies = y_up @ camera @ GL_FROM_CV, y_up @ bodies
     return {
         "depth_sensor": sky_is(0, z),
-        "position": camera[:3, 3],
-        "rotation": wxyz(camera),
-        "object_position": bodies[:, :3, 3],
-        "object_rotation": wxyz(bodies),
+        **apart("position", "rotation", camera),
+        **apart("object_position", "object_rotation", bodies),
         "semantic_sensor": names(body, 0).astype(np.int32),
     }
 
 
-def kubric(t):
-    z, body, camera, bodies = scene(t)
-    u, v = np.moveaxis(truth(t) if t else np.zeros((HEIGHT, WIDTH, 2)), -1, 0)
-    camera = camera @ GL_FROM_CV
+def kubric(z, body, camera, bodies, flow):
+    u, v = flow
     return {
         "depth": ray_lengths(sky_is(1e10, z))[..., None].astype(np.float32),
         "z": sky_is(1e10, z)[..., None],
-        "positions": camera[:3, 3],
-        "quaternions": wxyz(camera),
-        "instance_positions": bodies[:, :3, 3],
-        "instance_quaternions": wxyz(bodies),
+        **apart("positions", "quaternions", camera @ GL_FROM_CV),
+        **apart("instance_positions", "instance_quaternions", bodies),
         "segmentations": names(body, 0)[..., None].astype(np.uint8),
         "backward_flow": np.stack([-v, -u], -1).astype(np.float32),  # (row, column), to t - 1
     }
@@ -206,8 +195,7 @@ def mirrored(pose, world, own):
     return turned
 
 
-def ai2thor(t):
-    z, body, camera, bodies = scene(t)
+def ai2thor(z, body, camera, bodies, _):
     y_up = np.array([[0, -1, 0], [0, 0, 1], [1, 0, 0]])  # Unity's x right, y up, z ahead
     camera_axes = np.diag([1.0, -1.0, 1.0])
     return {
@@ -218,8 +206,7 @@ def ai2thor(t):
     }
 
 
-def carla(t):
-    z, body, camera, bodies = scene(t)
+def carla(z, body, camera, bodies, _):
     y_right = np.diag([1.0, -1.0, 1.0])
     camera_axes = np.array([[0, 0, 1], [1, 0, 0], [0, -1, 0]])  # x ahead, y right, z up
     normalised = np.where(np.isinf(z), 1.0, z / 1000)
@@ -233,8 +220,7 @@ def carla(t):
     }
 
 
-def airsim(t):
-    z, body, camera, bodies = scene(t)
+def airsim(z, body, camera, bodies, _):
     ned = rigid((180, 0, 0), (0, 0, 0))  # x ahead, y right, z down
     camera_axes = np.eye(4)
     camera_axes[:3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
@@ -242,42 +228,37 @@ def airsim(t):
     return {
         "DepthPlanar": sky_is(65504, z),
         "DepthPerspective": sky_is(65504, ray_lengths(z)),
-        "camera_position": camera[:3, 3],
-        "camera_orientation": wxyz(camera),
-        "object_positions": bodies[:, :3, 3],
-        "object_orientations": wxyz(bodies),
+        **apart("camera_position", "camera_orientation", camera),
+        **apart("object_positions", "object_orientations", bodies),
         "segmentation": names(body, 0).astype(np.int32),
     }
 
 
-def pybullet(t):
-    z, body, camera, bodies = scene(t)
+def pybullet(z, body, camera, bodies, _):
     buffer = FAR_M * (1 - NEAR_M / z) / (FAR_M - NEAR_M)
     buffer[np.isinf(z)] = 1.0
     return {
         "depth": buffer.astype(np.float32),
         "view": np.linalg.inv(camera @ GL_FROM_CV),
-        "positions": bodies[:, :3, 3],
-        "orientations": xyzw(bodies),
+        **apart("positions", "orientations", bodies, xyzw),
         "segmentation": names(body, -1).astype(np.int32),
     }
 
 
-WRITERS = {
-    "isaac_lab": isaac_lab,
-    "isaac_lab_2": lambda t: isaac_lab(t, wxyz),
-    "maniskill": maniskill,
-    "mujoco": mujoco,
-    "mjlab": mjlab,
-    "newton": newton,
-    "genesis": genesis,
-    "habitat": habitat,
-    "kubric": kubric,
-    "ai2thor": ai2thor,
-    "carla": carla,
-    "airsim": airsim,
-    "pybullet": pybullet,
-}
+_WRITERS = (
+    *(isaac_lab, maniskill, mujoco, mjlab, newton, genesis, habitat, kubric, ai2thor, carla),
+    *(airsim, pybullet),
+)
+WRITERS = {writer.__name__: writer for writer in _WRITERS}
+WRITERS["isaac_lab_2"] = functools.partial(isaac_lab, quaternion=wxyz)
+
+
+def buffers_of(simulator, t):
+    """What a simulator's writer makes of the scene, and of its flow (u, v) since the last step."""
+    flow = truth(t) if t else np.zeros((HEIGHT, WIDTH, 2))
+    return WRITERS[simulator](*scene(t), np.moveaxis(flow, -1, 0))
+
+
 ARGUMENTS = {
     "mujoco": {"far_m": FAR_M},
     "genesis": {"far_m": FAR_M},
@@ -288,32 +269,19 @@ ARGUMENTS = {
 }
 
 
-class Replayed(EnvBase):
-    """An env that gives a writer's buffers, under "camera"."""
+class Replayed(FakeSensorEnv):
+    """Gives the buffers that `writer` makes of a time, under "camera", in an episode of 3 steps."""
 
     def __init__(self, writer):
         super().__init__()
-        self.write, self.t = writer, 0
+        self.write = writer
         first = {name: torch.as_tensor(value) for name, value in writer(0).items()}
         specs = {name: Unbounded(x.shape, dtype=x.dtype) for name, x in first.items()}
         self.observation_spec = Composite(camera=Composite(specs))
-        self.action_spec, self.reward_spec = Categorical(2), Unbounded(1)
 
     def _observe(self):
-        buffers = {name: torch.as_tensor(value) for name, value in self.write(self.t).items()}
+        buffers = {name: torch.as_tensor(x) for name, x in self.write(self.steps[0]).items()}
         return TensorDict(camera=TensorDict(buffers))
-
-    def _reset(self, tensordict=None, **kwargs):
-        self.t = 0
-        return self._observe()
-
-    def _step(self, tensordict):
-        self.t += 1
-        done = torch.tensor([self.t == STEPS - 1])
-        return self._observe().update({"done": done, "reward": torch.zeros(1)})
-
-    def _set_seed(self, seed):
-        pass
 
 
 def rollout(simulator, writer=None, **options):
@@ -321,7 +289,9 @@ def rollout(simulator, writer=None, **options):
     stack = [RawFlow(K), FlowFactorize(K)]
     if options.get("flow"):
         stack = stack[1:]
-    env = TransformedEnv(Replayed(writer or WRITERS[simulator]), Compose(*sensors, *stack))
+    env = TransformedEnv(
+        Replayed(writer or functools.partial(buffers_of, simulator)), Compose(*sensors, *stack)
+    )
     check_env_specs(env)
     return env.rollout(STEPS)["next"]
 
@@ -341,31 +311,24 @@ def assert_is_the_truth(frames, *, bodies=True, pixels=2e-3):
     assert abs(raw - ego).max() > 0.3
 
 
-@pytest.mark.parametrize("simulator", CONVENTIONS)
-def test_a_simulators_buffers_become_the_scene_that_they_were_made_of(simulator):
-    frames = rollout(simulator, body_ids=IDS, **ARGUMENTS.get(simulator, {}))
-    assert_is_the_truth(frames)
-
-
-DEPTHS = [
-    (simulator, depth)
+# Each simulator as it is, by its other kinds of depth, and by its flow, without any body's pose.
+READINGS = [(simulator, {"body_ids": IDS}) for simulator in CONVENTIONS]
+READINGS += [
+    (simulator, {"body_ids": IDS, "depth": depth})
     for simulator, row in CONVENTIONS.items()
     for depth in list(row.depth)[1:]
-    if depth in WRITERS[simulator](0)
+    if depth in buffers_of(simulator, 0)
 ]
+READINGS += [(simulator, {"flow": True}) for simulator, row in CONVENTIONS.items() if row.flow]
 
 
-@pytest.mark.parametrize(("simulator", "depth"), DEPTHS)
-def test_the_other_kinds_of_depth_become_the_same(simulator, depth):
-    needed = {"intrinsics"} & set(CONVENTIONS[simulator].depth[depth])
-    given = {k: v for k, v in ARGUMENTS.get(simulator, {}).items() if k != "intrinsics"}
-    given |= dict.fromkeys(needed, K)
-    assert_is_the_truth(rollout(simulator, depth=depth, body_ids=IDS, **given))
-
-
-@pytest.mark.parametrize("simulator", [name for name, row in CONVENTIONS.items() if row.flow])
-def test_measured_flow_becomes_the_truth_without_any_pose_of_a_body(simulator):
-    assert_is_the_truth(rollout(simulator, flow=True, **ARGUMENTS.get(simulator, {})))
+@pytest.mark.parametrize(("simulator", "options"), READINGS, ids=str)
+def test_a_simulators_buffers_become_the_scene_that_they_were_made_of(simulator, options):
+    given = ARGUMENTS.get(simulator, {})
+    if "depth" in options:  # only some kinds need K
+        needed = {"intrinsics"} & set(CONVENTIONS[simulator].depth[options["depth"]])
+        given = {k: v for k, v in given.items() if k != "intrinsics"} | dict.fromkeys(needed, K)
+    assert_is_the_truth(rollout(simulator, **options, **given))
 
 
 def test_without_bodies_nothing_else_is_read():
@@ -380,7 +343,9 @@ def test_without_bodies_nothing_else_is_read():
 @pytest.mark.parametrize(("background_m", "options"), [(0.0, {}), (50.0, {"far_m": 50.0})])
 def test_isaac_labs_depth_may_be_clipped_to_zero_or_to_the_far_plane(depth, background_m, options):
     def clipped(t):
-        buffers = isaac_lab(t)  # zero is Newton Warp's background without clipping, too
+        buffers = buffers_of(
+            "isaac_lab", t
+        )  # zero is Newton Warp's background without clipping, too
         return buffers | {depth: np.where(np.isinf(buffers[depth]), background_m, buffers[depth])}
 
     rays = {"intrinsics": K} if depth == "distance_to_camera" else {}
@@ -394,7 +359,7 @@ def test_colours_are_not_taken_for_ids(simulator):
 
     def colourful(t):
         colours = np.random.default_rng(t).integers(0, 256, (HEIGHT, WIDTH, 4), dtype=np.uint8)
-        return WRITERS[simulator](t) | {row.ids["key"]: colours}
+        return buffers_of(simulator, t) | {row.ids["key"]: colours}
 
     with pytest.raises(ValueError, match=re.escape(row.ids["if_colours"])):
         rollout(simulator, colourful, body_ids=IDS, **ARGUMENTS.get(simulator, {}))
@@ -403,7 +368,7 @@ def test_colours_are_not_taken_for_ids(simulator):
 @pytest.mark.parametrize(("simulator", "other"), [("mujoco", 6), ("mjlab", 9)])  # a site, a flex
 def test_sites_and_flexes_are_no_bodies_and_are_named(simulator, other):
     def with_marker(t):
-        buffers = WRITERS[simulator](t)
+        buffers = buffers_of(simulator, t)
         segmentation = buffers["segmentation"].copy()
         segmentation[4, :3] = IDS[0], other  # its number is that of the first body's geom
         return buffers | {"segmentation": segmentation}
@@ -420,29 +385,11 @@ def test_sites_and_flexes_are_no_bodies_and_are_named(simulator, other):
 
 def test_keys_may_be_elsewhere():
     def moved(t):
-        buffers = maniskill(t)
+        buffers = buffers_of("maniskill", t)
         return {"z" if name == "depth" else name: value for name, value in buffers.items()}
 
     frames = rollout("maniskill", moved, body_ids=IDS, keys={"depth": ("camera", "z")})
     assert_is_the_truth(frames)
-
-
-@pytest.mark.parametrize(
-    ("call", "names"),
-    [
-        (lambda: sensors_from("isaac"), "isaac_lab"),
-        (lambda: sensors_from("newton", depth="z"), "forward_depth"),
-        (lambda: sensors_from("mujoco"), "far_m"),
-        (lambda: sensors_from("maniskill", far_m=9.0), "far_m"),
-        (lambda: sensors_from("kubric"), "intrinsics"),
-        (lambda: sensors_from("carla", flow=True), "flow"),
-        (lambda: sensors_from("carla", static_ids=[7]), "body_ids"),
-        (lambda: sensors_from("newton", keys={"depth": "z"}), "depth"),
-    ],
-)
-def test_mistakes_are_named(call, names):
-    with pytest.raises(ValueError, match=names):
-        call()
 
 
 PAGE = Path(__file__).parents[2] / "docs" / "in_your_simulator.md"

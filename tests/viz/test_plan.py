@@ -19,6 +19,11 @@ def layout():
     return Layout(load_scene("three_way_junction"))
 
 
+@pytest.fixture(scope="module")
+def plan(layout):
+    return draw_plan(layout)
+
+
 def labels(figure):
     return [text.get_text() for text in figure.legends[0].get_texts()]
 
@@ -44,18 +49,17 @@ def test_a_track_is_drawn_in_its_outcomes_colour_where_it_was_driven(layout):
     assert "x (m)" in axes.get_xlabel()
 
 
-def test_the_legend_names_only_what_the_scene_has(layout):
-    names = labels(draw_plan(layout))
-    for name in ("road", "crosswalk", "terrain", "tree", "fence", "car", "traffic light"):
-        assert name in names
+def test_the_legend_names_only_what_the_scene_has(plan):
+    has = {"road", "crosswalk", "terrain", "tree", "fence", "car", "traffic light"}
+    assert has <= {*labels(plan)}
     straight = labels(draw_plan(Layout(load_scene("straight_road"))))
     assert "tree" not in straight
     assert "pedestrians who stand" not in straight  # everyone there walks
     assert not any("exit" in name for name in straight)
 
 
-def test_buildings_and_obstacles_lie_wholly_within_a_plan(layout):
-    (axes,) = draw_plan(layout).axes
+def test_buildings_and_obstacles_lie_wholly_within_a_plan(layout, plan):
+    (axes,) = plan.axes
     (x0, x1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
     for box in (*layout.buildings, *layout.obstacles):
         left, lower, right, upper = box.footprint.bounds
@@ -63,8 +67,8 @@ def test_buildings_and_obstacles_lie_wholly_within_a_plan(layout):
         assert y0 < lower < upper < y1
 
 
-def test_every_zone_of_a_path_has_its_name_at_its_place(layout):
-    (axes,) = draw_plan(layout).axes
+def test_every_zone_of_a_path_has_its_name_at_its_place(layout, plan):
+    (axes,) = plan.axes
     named = {text.get_text(): text.xy for text in axes.texts if text.get_text()}
     assert set(named) == {"entry", "left end", "right end"}
     # The start lies about the first road's 7th metre, which runs along x from the origin.
@@ -73,14 +77,15 @@ def test_every_zone_of_a_path_has_its_name_at_its_place(layout):
         assert layout.zones[name.replace(" ", "_")].contains(Point(place))
 
 
-def test_a_plan_of_a_path_shows_only_the_closures_of_that_path(layout):
-    def closed(path):
-        patches = draw_plan(layout, path=path).axes[0].patches
+def test_a_plan_of_a_path_shows_only_the_closures_of_that_path(layout, plan):
+    def closed(figure):
+        patches = figure.axes[0].patches
         dark = [patch for patch in patches if to_hex(patch.get_facecolor()) == "#303030"]
         return [patch.get_path().vertices.mean(axis=0) for patch in dark]
 
-    assert len(closed(None)) == 2
-    assert "exit, closed on some paths" in labels(draw_plan(layout))
-    assert "closed exit" in labels(draw_plan(layout, path="left"))
-    (only,) = closed("left")  # drives to the left, +y, with the right arm closed
+    assert len(closed(plan)) == 2
+    assert "exit, closed on some paths" in labels(plan)
+    left = draw_plan(layout, path="left")
+    assert "closed exit" in labels(left)
+    (only,) = closed(left)  # drives to the left, +y, with the right arm closed
     assert only[1] < 0

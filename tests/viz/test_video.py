@@ -57,25 +57,22 @@ def test_a_full_disk_ends_in_one_line_and_leaves_the_old_film(tmp_path, frames):
     assert [file.name for file in tmp_path.iterdir()] == ["episode.mp4"]
 
 
-def test_an_interrupted_film_leaves_no_file(tmp_path):
-    def interrupted():
-        yield from noise(2)
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        viz.write_video(tmp_path / "episode.mp4", interrupted(), fps=12)
-    assert not [*tmp_path.iterdir()]
-
-
-def test_a_film_without_frames_is_an_error_and_leaves_no_file(tmp_path):
-    with pytest.raises(OSError, match=r"episode\.mp4"):
-        viz.write_video(tmp_path / "episode.mp4", [], fps=12)
-    assert not [*tmp_path.iterdir()]
+def interrupted():
+    yield from noise(2)
+    raise KeyboardInterrupt
 
 
 @pytest.mark.parametrize(
-    "frame", [np.full((32, 32, 3), 0.5), np.zeros((32, 32, 4), np.uint8)], ids=["float", "alpha"]
+    ("frames", "error", "said"),
+    [
+        (interrupted(), KeyboardInterrupt, ""),
+        ([], OSError, r"film\.mp4"),
+        ([np.full((32, 32, 3), 0.5)], ValueError, r"\[H, W, 3\] uint8"),
+        ([np.zeros((32, 32, 4), np.uint8)], ValueError, r"\[H, W, 3\] uint8"),
+    ],
+    ids=["interrupted", "no frames", "float", "alpha"],
 )
-def test_a_frame_that_is_no_rgb_picture_is_refused(tmp_path, frame):
-    with pytest.raises(ValueError, match=r"\[H, W, 3\] uint8"):
-        viz.write_video(tmp_path / "film.mp4", [frame], fps=4)
+def test_a_film_that_is_not_written_to_its_end_leaves_no_file(tmp_path, frames, error, said):
+    with pytest.raises(error, match=said):
+        viz.write_video(tmp_path / "film.mp4", frames, fps=12)
+    assert not [*tmp_path.iterdir()]
