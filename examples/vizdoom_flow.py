@@ -4,7 +4,7 @@
     python examples/vizdoom_flow.py strip.png
 
 ViZDoom's documentation doesn't state its conventions. They were measured by casting rays through
-its maps; tests/examples/test_vizdoom_flow.py checks them by warping frames with the flow:
+its maps; tests/examples/test_other_simulators.py checks them by warping frames with the flow:
 
 - 32 map units are a metre, and depth is a byte, linear in z: 7.16 · (byte + 2) units on floors and
   ceilings, which have label 1, and 7.16 · (byte + 1.19) on walls and sprites at 240 rows;

@@ -52,28 +52,36 @@ def pytest_collection_finish():
     gc.enable()
 
 
-LACKS_PYBULLET = not is_installed("pybullet")  # Python 3.14 has no wheels of it
-NEEDS_PYBULLET = "needs the simulated streets, and PyBullet is not installed"
+OPTIONAL = {
+    "pybullet": "the simulated streets need PyBullet",  # Python 3.14 has no wheels of it
+    "cv2": "recordings need OpenCV",
+    "imageio": "videos need imageio",
+    "rosbags": "pip install 'flowrep-rl[rosbag]'",
+    "scipy": "pip install 'flowrep-rl[report]'",
+    "jinja2": "pip install 'flowrep-rl[report]'",
+}
+MISSING = {name: why for name, why in OPTIONAL.items() if not is_installed(name)}
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_make_collect_report(collector):
-    """Skips files that can't be imported without PyBullet."""
+    """Skips files that can't be imported without a package that is missing."""
     report = yield
-    if LACKS_PYBULLET and report.failed and "pybullet" in str(report.longrepr):
+    needed = [name for name in MISSING if report.failed and name in str(report.longrepr)]
+    if needed:
         report.outcome = "skipped"
-        report.longrepr = (str(collector.path), 0, f"Skipped: {NEEDS_PYBULLET}")
+        report.longrepr = (str(collector.path), 0, f"Skipped: {MISSING[needed[0]]}")
     return report
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item, call):
-    """Skips tests that import PyBullet as they run, where it is missing."""
+    """Skips tests that import a missing package as they run."""
     report = yield
     error = call.excinfo and call.excinfo.value
-    if LACKS_PYBULLET and isinstance(error, ModuleNotFoundError) and error.name == "pybullet":
+    if isinstance(error, ModuleNotFoundError) and error.name in MISSING:
         report.outcome = "skipped"
-        report.longrepr = (str(item.path), 0, f"Skipped: {NEEDS_PYBULLET}")
+        report.longrepr = (str(item.path), 0, f"Skipped: {MISSING[error.name]}")
     return report
 
 
@@ -152,8 +160,10 @@ def short_folder():
 
 @pytest.fixture
 def victim(tmp_path):
-    """A table of the user's, which links of a stranger point at."""
+    """A table of the user's, which links of a stranger point at; nothing changes it."""
     path = tmp_path / "elsewhere" / "victim"
     path.parent.mkdir()
     path.write_text("frames,alpha\n1,2\n")
-    return path
+    yield path
+    assert path.read_text() == "frames,alpha\n1,2\n"
+    assert [*path.parent.iterdir()] == [path]

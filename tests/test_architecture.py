@@ -35,14 +35,8 @@ FLOWREP_IMPORTS_ALLOWED = {
 THIRD_PARTY_ONLY_IN = {
     "pybullet": {"simulator/bullet.py", "pybullet.py"},
     "numba": {"extras.py"},
-    "hydra": {
-        "train.py",
-        "view.py",
-        "factorize.py",
-        "config/cli.py",
-        "config/config_dir.py",
-        "sweep.py",
-    },
+    "hydra": {"train.py", "view.py", "factorize.py", "sweep.py", "config/cli.py"}
+    | {"config/config_dir.py"},
 }
 # Extras: imported by the functions that need them, never before.
 LAZILY = {
@@ -79,12 +73,6 @@ def imports(path: Path, *, in_functions: bool = True) -> set[tuple[str, str]]:
     return found
 
 
-def flowrep_imports(path: Path) -> set[str]:
-    """The packages of flowrep, and modules beside them, that a file imports."""
-    dotted = [f"{module}.{name}".split(".") for module, name in imports(path)]
-    return {names[1] for names in dotted if names[0] == "flowrep"} & PARTS
-
-
 def packages_of(imported: set[tuple[str, str]]) -> set[str]:
     """Those that are neither flowrep's nor Python's."""
     return {module.split(".")[0] for module, _ in imported} - {"flowrep"} - sys.stdlib_module_names
@@ -98,7 +86,8 @@ def test_imports_point_one_way(path):
     place = path.relative_to(PACKAGE)
     part = place.parts[0].removesuffix(".py")
     imported = {module for module, _ in imports(path)}
-    inside = flowrep_imports(path)
+    dotted = [f"{module}.{name}".split(".") for module, name in imports(path)]
+    inside = {names[1] for names in dotted if names[0] == "flowrep"} & PARTS
     outside = packages_of(imports(path))
     if part in FLOWREP_IMPORTS_ALLOWED:
         assert inside <= FLOWREP_IMPORTS_ALLOWED[part]

@@ -7,8 +7,6 @@ import pytest
 from flowrep.config import config_groups, group_choices
 from tests.config.composing import composed, plain
 
-pytest.importorskip("pybullet", reason="composed configs are built into environments")
-
 # Those of a training: `format` is of recordings, see tests/test_factorize.py.
 GROUPS = [group for group in config_groups() if group != "format"]
 GROUP_FILES = [(group, name) for group in GROUPS for name in group_choices(group)]

@@ -2,19 +2,14 @@
 
 import ast
 import re
-from pathlib import Path
 
 import pytest
 import torch
 
 from flowrep.geometry import ego_flow, project, relative_motion, unproject
+from tests.running import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
-LINES = [
-    line
-    for line in (ROOT / "CONVENTIONS.md").read_text(encoding="utf-8").splitlines()
-    if line.startswith("- ")
-]
+LINES = re.findall(r"^- .*", (ROOT / "CONVENTIONS.md").read_text("utf-8"), re.MULTILINE)
 
 
 @pytest.mark.parametrize("line", LINES, ids=lambda line: line[2:40])

@@ -10,16 +10,12 @@ import pytest
 import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-pytest.importorskip("pybullet", reason="agents are evaluated in the simulated street")
-
 from examples import export_agent, share_agent
-from flowrep import view
 from flowrep.agent import CheckpointError
 from flowrep.baselines import BaselinePolicy
-from flowrep.config.options import validated
 from flowrep.config.usage import UsageError
 from flowrep.envs import WorkerError
-from flowrep.evaluate import candidates_of, main
+from flowrep.evaluate import candidates_of
 from flowrep.evaluate import run as evaluate
 from flowrep.experiment import build
 from flowrep.experiment.agents import Agent
@@ -27,9 +23,9 @@ from flowrep.experiment.evaluation import PairedEvaluation
 from flowrep.experiment.policies import PolicyError
 from flowrep.experiment.run import RunFolder, RunFolderError
 from flowrep.experiment.runner import Runner
-from flowrep.experiment.schema import EvaluateConfig
 from flowrep.files import TableError
-from tests.config.composing import composed, plain
+from tests.config.composing import composed, config_of
+from tests.running import run_here
 
 pytestmark = pytest.mark.slow
 
@@ -51,8 +47,7 @@ def saved(path, *overrides):
 
 
 def asked(*overrides):
-    quick = ["episodes=2", "baselines=[]", *QUICK]
-    return validated(EvaluateConfig, plain("evaluate", *quick, *overrides))
+    return config_of("evaluate", "episodes=2", "baselines=[]", *QUICK, *overrides)
 
 
 @pytest.fixture(scope="module")
@@ -69,21 +64,12 @@ def untouched(run):
     run.evaluation_path.unlink(missing_ok=True)
 
 
-def test_evaluated_again_the_table_is_the_same_byte_for_byte(untouched):
-    many = [f"run={untouched.path}", "policy=sampled", "speed=[low,high]", "baselines=[random]"]
-    evaluate(asked(*many))
-    before = untouched.evaluation_path.read_bytes()
-    evaluate(asked(*many))
-    assert untouched.evaluation_path.read_bytes() == before
-    rows = untouched.read_episodes()
-    assert {row["evaluation"] for row in rows} == {"evaluate"}
-
-
 def test_an_agent_drives_at_the_frame_rate_of_its_scene_unless_another_is_given(tmp_path):
     folder = saved(tmp_path / "slow", "representations=[obj]", "scene.frame_rate_hz=10")
     evaluate(asked(f"run={folder.path}"))
     evaluate(asked(f"run={folder.path}", "fps=12"))
-    assert [row["fps"] for row in folder.read_episodes()] == ["10.0"] * 2 + ["12.0"] * 2
+    rows = [(row["fps"], row["evaluation"]) for row in folder.read_episodes()]
+    assert rows == [("10.0", "evaluate")] * 2 + [("12.0", "evaluate")] * 2
 
 
 def test_a_run_that_is_named_twice_is_evaluated_once(run, tmp_path):
@@ -105,16 +91,13 @@ def test_an_agent_drives_in_another_scene_and_changed_scenes_are_told_apart(unto
     assert {row["length"] for row in rows} == {"3", "4"}
 
 
-@pytest.mark.parametrize(("key", "command"), [("run", main), ("policy", view.main)])
+@pytest.mark.parametrize("typed", ["flowrep.evaluate run", "flowrep.view policy"])
 def test_a_camera_that_was_typed_for_an_agent_that_keeps_its_own_is_refused(
-    key, command, run, monkeypatch, capsys
+    typed, run, monkeypatch, capsys
 ):
     # The scene's height differs, too, but was not typed.
-    line = [f"{key}={run.path}", "scene=s_turn", "++scene.camera.width_px=18"]
-    monkeypatch.setattr("sys.argv", ["flowrep", *line])
-    with pytest.raises(SystemExit) as ended:
-        command()
-    assert ended.value.code == 2
+    line = f"python {typed}={run.path} scene=s_turn ++scene.camera.width_px=18"
+    assert run_here(monkeypatch, line.split()) == 2
     assert "error: scene.camera.width_px=18: " in capsys.readouterr().err
 
 
@@ -146,22 +129,22 @@ def test_a_damaged_table_is_refused_before_an_episode_is_run(untouched, monkeypa
 # Agents that go straight on, in folders of which the good ones can be evaluated.
 
 
-class StraightOn:
-    """Before one of its steps, it does something else."""
-
-    def __init__(self):
-        self.steps, self.at, self.act = 0, 0, lambda: None
-
-    def __call__(self, tensordict):
-        self.steps += 1
-        if self.steps == self.at:
-            self.act()
-        return tensordict.set("action", torch.zeros(tensordict.batch_size, dtype=torch.int64))
+def turn_left(tensordict):
+    return tensordict.set("action", torch.ones(tensordict.batch_size, dtype=torch.int64))
 
 
 @pytest.fixture
 def driver():
-    return StraightOn()
+    """Drives straight on; before its step number `at` it does something else."""
+
+    def driver(tensordict):
+        driver.steps += 1
+        if driver.steps == driver.at:
+            driver.act()
+        return tensordict.set("action", torch.zeros(tensordict.batch_size, dtype=torch.int64))
+
+    driver.steps = driver.at = 0
+    return driver
 
 
 @pytest.fixture
@@ -173,7 +156,8 @@ def some(tmp_path, monkeypatch, driver):
     def load(path, *, scene=None, trusted=(), **machine):
         if not path.name.startswith("good"):
             raise CheckpointError(f"no checkpoint in {path}")
-        return Agent(driver, config.model_copy(update=machine), 64, config.scene)
+        drives = turn_left if path.name == "good_left" else driver
+        return Agent(drives, config.model_copy(update=machine), 64, config.scene)
 
     def make(*names, overrides=()):
         monkeypatch.setattr(Agent, "load", load)
@@ -186,15 +170,16 @@ def some(tmp_path, monkeypatch, driver):
     return make
 
 
-def test_the_runs_of_a_sweep_are_evaluated_on_the_same_episodes(some, monkeypatch):
+def test_the_runs_of_a_sweep_are_evaluated_beside_the_same_episodes_of_baselines(some, monkeypatch):
     drivers, enter = [], BaselinePolicy.enter
     monkeypatch.setattr(
         BaselinePolicy, "enter", lambda self, env: drivers.append(self.name) or enter(self, env)
     )
-    folders, config = some("good_1", "good_2", overrides=["baselines=[random]"])
+    folders, config = some("good", "good_left", overrides=["baselines=[random]"])
     evaluate(config)
-    assert folders[0].read_episodes() == folders[1].read_episodes()
-    assert len(folders[0].read_episodes()) == 4
+    ours, theirs = (folder.read_episodes() for folder in folders)
+    assert [row["policy"] for row in ours] == ["greedy"] * 2 + ["random"] * 2
+    assert [a == b for a, b in zip(ours, theirs, strict=True)] == [False] * 2 + [True] * 2
     assert drivers == ["random"]  # once for both
 
 
@@ -238,7 +223,7 @@ def workers():
 
 
 MANY = ["speed=[low,high]", "episodes=8", "num_envs=4", "baselines=[never_turn]"]
-STEPS_OF_A_GROUP = 100  # 8 episodes of at most 40 steps, 4 at a time
+ONE_GROUP_ENDED = 130  # 8 episodes of at most 40 steps, 4 at a time; some of the second, too
 
 
 def of_low_speed(rows):
@@ -260,7 +245,7 @@ def test_an_evaluation_that_was_stopped_keeps_whole_groups_and_leaves_no_trace_o
         for process in (*workers(), os.getpid()):
             os.kill(process, number)
 
-    driver.at, driver.act = driver.steps + STEPS_OF_A_GROUP, signal_all
+    driver.at, driver.act = driver.steps + ONE_GROUP_ENDED, signal_all
     again = config.model_copy(update={"run": [str(folder.path)]})
     with pytest.raises(SystemExit) as ended:
         evaluate(again.model_copy(update={"num_workers": num_workers}))
@@ -272,10 +257,17 @@ def test_an_evaluation_that_was_stopped_keeps_whole_groups_and_leaves_no_trace_o
 
 def test_a_worker_that_is_killed_is_named_and_what_ended_before_is_kept(some, driver, workers):
     (folder,), config = some("good", overrides=MANY)
-    driver.at, driver.act = STEPS_OF_A_GROUP, lambda: os.kill(workers()[0], signal.SIGKILL)
+    saved = []
+
+    def kill():
+        saved.append(len(folder.read_episodes()))
+        os.kill(workers()[0], signal.SIGKILL)
+
+    driver.at, driver.act = ONE_GROUP_ENDED, kill
     with pytest.raises(WorkerError, match=r"environments \d to \d is gone \(exit code -9\)"):
         evaluate(config.model_copy(update={"num_workers": 2}))
     rows = folder.read_episodes()
+    assert saved == [8]  # before the next group ended
     assert len(rows) == 8
     assert rows == of_low_speed(rows)
 

@@ -7,36 +7,31 @@ import json
 import re
 import shutil
 import signal
-import sys
+from functools import partial
 from pathlib import Path
 
+import cv2
+import imageio.v3 as imageio
 import numpy as np
 import pytest
 from hydra.utils import get_class
 from omegaconf import OmegaConf
 
-pytest.importorskip("cv2", reason="recordings need OpenCV")
-
-import cv2
-import imageio.v3 as imageio
-
 from flowrep.config import CONF_DIR, group_choices
-from flowrep.config.options import validated
 from flowrep.config.usage import UsageError
-from flowrep.factorize import FactorizeConfig, factorize_recording, main, open_stream
+from flowrep.factorize import factorize_recording, open_stream
 from flowrep.files import read_rows
 from flowrep.sequences import Frame, SequenceError, open_recording, read_flow, recorded_motion
 from flowrep.sequences.formats import declaration
 from flowrep.sequences.job import Job
 from flowrep.sequences.output import Output
-from tests.config.composing import plain
+from tests.config.composing import config_of
+from tests.running import run_here
 from tests.sequences import synthetic
 from tests.sequences.synthetic import SEVEN_SCENES, needs_7scenes
 from tests.test_files import fails
 
-
-def settings(*overrides) -> FactorizeConfig:
-    return validated(FactorizeConfig, plain("factorize", *overrides))
+settings = partial(config_of, "factorize")
 
 
 def factorize(tmp_path, *overrides, source="in", format="frames"):
@@ -47,10 +42,6 @@ def factorize(tmp_path, *overrides, source="in", format="frames"):
 
 def table(folder):
     return read_rows(folder / "frames.csv")
-
-
-def files_of(folder):
-    return sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
 
 
 @pytest.fixture
@@ -73,7 +64,8 @@ def test_a_job_writes_flow_pictures_masks_tables_and_a_video(moments, tmp_path):
     others = ["flow/0001.npz", "flow/0002.npz", *(f"pictures/{k}/0002.png" for k in kinds)]
     others += ["moving/0001.png", "moving/0002.png"]
     tables = ["frames.csv", "job.json", "strip.mp4", "summary.json", "trajectory.txt"]
-    assert files_of(out) == sorted([*flows, *others, *tables])
+    written = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file()}
+    assert written == {*flows, *others, *tables}
     assert not (tmp_path / "out.partial").exists()
     for name, moment in zip(("0001", "0002"), moments[1:]):
         np.testing.assert_array_equal(read_flow(out / f"flow/raw/{name}.flo"), moment.raw)
@@ -310,19 +302,6 @@ def test_a_format_gives_options_of_its_reader_and_the_plain_layout_all(name):
             open_stream(settings(*(text for text in given if not text.startswith(f"format.{key}"))))
 
 
-def run(monkeypatch, *arguments) -> int:
-    monkeypatch.setattr(sys, "argv", ["factorize", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return ended.value.code
-
-
-def test_a_missing_file_that_is_typed_is_refused(moments, tmp_path, monkeypatch, capsys):
-    where = [f"input={tmp_path / 'in'}", f"output={tmp_path / 'out'}", "format=frames"]
-    assert run(monkeypatch, *where, "format.times=times.txt", "flow=exact") == 2
-    assert "error: format.times: there is no file" in capsys.readouterr().err
-
-
 EXPECTED = {"frames": "depth/*, ", "tum": "depth.txt", "kitti": "image_2"}
 
 
@@ -349,8 +328,9 @@ def test_a_format_of_ones_own_says_what_is_different(moments, tmp_path, monkeypa
     own += ["depth_unit_m: 0.1", "intrinsics: [31.0, 27.0, 18.0, 12.5]", "first_pixel_centre: 0.0"]
     synthetic.put(tmp_path / "conf/format/mine.yaml", own)
     out = tmp_path / "out"
-    where = ["--config-dir", str(tmp_path / "conf"), "format=mine", "flow=exact", "video=false"]
-    assert run(monkeypatch, *where, f"input={folder}", f"output={out}") == 0
+    line = ["python", "flowrep.factorize", "--config-dir", str(tmp_path / "conf"), "format=mine"]
+    line += ["flow=exact", "video=false", f"input={folder}", f"output={out}"]
+    assert run_here(monkeypatch, line) == 0
     for moment, name in zip(moments[1:], ("0001", "0002")):
         obj = read_flow(out / f"flow/obj/{name}.flo")
         np.testing.assert_allclose(obj, moment.obj, atol=2e-4)

@@ -7,18 +7,14 @@ import sys
 import pytest
 import torch
 
-pytest.importorskip("pybullet", reason="the environments are built with it")
-
 from flowrep.baselines import BaselinePolicy
-from flowrep.config.options import validated
 from flowrep.config.usage import UsageError
 from flowrep.experiment import build
 from flowrep.experiment.agents import Agent
 from flowrep.experiment.film import Film
 from flowrep.experiment.run import RunFolder
-from flowrep.experiment.schema import EvaluateConfig
 from flowrep.geometry import ego_flow
-from tests.config.composing import composed, plain
+from tests.config.composing import composed, config_of
 from tests.running import ROOT, run_here
 
 PAGE = ROOT / "docs" / "adding_a_representation.md"
@@ -104,7 +100,7 @@ def test_a_trusted_map_keeps_its_options_and_takes_no_others(config, folder):
     assert run.config(target).representations == config.representations  # one without a list
     typed = ["run=x", TYPED, "+representations.contact.steps=1.0"]
     with pytest.raises(UsageError, match="representations="):
-        validated(EvaluateConfig, plain("evaluate", *typed))
+        config_of("evaluate", *typed)
 
 
 def test_a_stored_representation_of_flowreps_names_no_code(config, folder):

@@ -20,12 +20,16 @@ from tests.running import run_python
     [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129), (signal.SIGUSR1, 138)],
     ids=["ctrl-c", "sigterm", "sighup", "slurm"],
 )
-def test_a_signal_asks_and_the_shell_gets_its_exit_code(number, code):
+def test_a_signal_asks_and_the_shell_gets_its_exit_code_until_earlier_handlers_are_back(
+    number, code
+):
+    before = signal.getsignal(number)
     with StopRequest() as stop:
         assert not stop
         os.kill(os.getpid(), number)
         assert stop
         assert stop.exit_code == code
+    assert signal.getsignal(number) is before
 
 
 def test_a_hang_up_that_nohup_ignores_stays_ignored():
@@ -46,13 +50,6 @@ def test_a_ctrl_c_after_a_signal_ends_at_once_and_another_sigterm_does_not(first
         assert stop.exit_code == 128 + first[0]
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
-
-
-def test_the_previous_handlers_come_back():
-    before = signal.getsignal(signal.SIGTERM)
-    with StopRequest():
-        assert signal.getsignal(signal.SIGTERM) is not before
-    assert signal.getsignal(signal.SIGTERM) is before
 
 
 # What a bar writes into a file.
@@ -94,21 +91,6 @@ def test_a_bar_starts_no_process_that_a_hang_up_would_end():
     assert run_python("-c", CHILDREN, check=True).stdout == "\n"
 
 
-def run_in_a_terminal(code):
-    """A process that runs code in a terminal of its own, and the other end of that terminal."""
-    end, terminal = pty.openpty()
-    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 100, 0, 0))
-
-    def take():
-        os.setsid()
-        fcntl.ioctl(0, termios.TIOCSCTTY, 0)
-
-    streams = dict.fromkeys(("stdin", "stdout", "stderr"), terminal)
-    process = subprocess.Popen([sys.executable, "-c", code], **streams, preexec_fn=take)
-    os.close(terminal)
-    return process, end
-
-
 HANGS_UP = """
 import sys, time
 from pathlib import Path
@@ -127,9 +109,17 @@ Path(sys.argv[1]).write_text(str(stop.exit_code))
 
 
 def test_a_closed_terminal_stops_as_sigterm_does_and_printing_to_it_is_no_error(tmp_path):
-    saved = tmp_path / "saved"
-    code = HANGS_UP.replace("sys.argv[1]", repr(str(saved)))
-    process, end = run_in_a_terminal(code)
+    saved, (end, terminal) = tmp_path / "saved", pty.openpty()
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 100, 0, 0))
+
+    def take():
+        os.setsid()
+        fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
+    streams = dict.fromkeys(("stdin", "stdout", "stderr"), terminal)
+    command = [sys.executable, "-c", HANGS_UP, str(saved)]
+    process = subprocess.Popen(command, **streams, preexec_fn=take)
+    os.close(terminal)
     while b"ready" not in os.read(end, 4096):
         pass
     os.close(end)
@@ -138,10 +128,9 @@ def test_a_closed_terminal_stops_as_sigterm_does_and_printing_to_it_is_no_error(
 
 
 def test_in_another_thread_nothing_is_caught():
+    def enters_and_leaves():
+        with StopRequest() as stop:
+            return not stop
+
     with ThreadPoolExecutor() as pool:
-        assert pool.submit(_enters_and_leaves).result()
-
-
-def _enters_and_leaves():
-    with StopRequest() as stop:
-        return not stop
+        assert pool.submit(enters_and_leaves).result()

@@ -7,6 +7,7 @@ import importlib.util
 import inspect
 import math
 import os
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -26,6 +27,7 @@ from tests.running import run_python
 HEIGHT, WIDTH = 90, 132
 VIEW = pybullet.computeViewMatrix([1.1, -0.9, 0.8], [0.1, 0, 0.3], [0, 0, 1])
 CV_FROM_GL = np.diag([1, -1, -1, 1])
+OFF_CENTRE = pybullet.computeProjectionMatrix(-0.07, 0.03, -0.02, 0.05, 0.1, 20.0)
 PLANE = 0
 
 
@@ -83,7 +85,8 @@ def heights(depth, K, view):
         {"fov_deg": 60.0},
         {"fov_deg": 40.0, "near_m": 0.2, "far_m": 1000.0},
         {"fov_deg": 75.0, "near_m": 0.02, "far_m": 3.0},
-        {"projection": pybullet.computeProjectionMatrix(-0.07, 0.03, -0.02, 0.05, 0.1, 20.0)},
+        {"projection": OFF_CENTRE},
+        {"projection": np.reshape(OFF_CENTRE, (4, 4))},
     ],
 )
 def test_a_floor_seen_through_k_is_flat(world, camera):
@@ -303,27 +306,24 @@ def test_rows_of_removed_bodies_are_reused_and_too_few_rows_are_refused(world):
 
 
 def test_two_cameras_and_two_clients_at_once_do_not_mix(world):
-    other = pybullet.connect(pybullet.DIRECT)
-    try:
-        ball = pybullet.createVisualShape(pybullet.GEOM_SPHERE, 0.2, physicsClientId=other)
-        ball = pybullet.createMultiBody(0, -1, ball, [0, 0, 0.3], physicsClientId=other)
-        crate = box(world, [0, 0, 0.3])
-        first, second = (BulletCamera(world, 60, 40, fov_deg=60, view=VIEW) for _ in range(2))
-        third = BulletCamera(other, 60, 40, fov_deg=60, view=VIEW)
-        for camera in (first, second, third):
-            camera.reset()
-        world.resetBasePositionAndOrientation(crate, [0.1, 0, 0.3], [0, 0, 0, 1])
-        moved = first()["instance_motion"][first.rows[crate, -1]]
-        assert not np.array_equal(moved, np.eye(4))
-        world.resetBasePositionAndOrientation(crate, [0.2, 0, 0.3], [0, 0, 0, 1])
-        twice = second()["instance_motion"][second.rows[crate, -1]]  # since its own last call
-        np.testing.assert_allclose(twice[:3, 3], 2 * moved[:3, 3], atol=1e-6)
-        seen = third()
-        assert np.array_equal(seen["instance_motion"], np.tile(np.eye(4), (65, 1, 1)))
-        assert set(third.rows) == {(ball, -1)}
-        assert set(np.unique(seen["instance"])) == {0, 1}
-    finally:
-        pybullet.disconnect(other)
+    other = BulletClient(pybullet.DIRECT)
+    ball, crate = box(other, [0, 0, 0.3]), box(world, [0, 0, 0.3])
+    clients = world, world, other._client  # the last by its number
+    first, second, third = (
+        BulletCamera(client, 60, 40, fov_deg=60, view=VIEW) for client in clients
+    )
+    for camera in (first, second, third):
+        camera.reset()
+    world.resetBasePositionAndOrientation(crate, [0.1, 0, 0.3], [0, 0, 0, 1])
+    moved = first()["instance_motion"][first.rows[crate, -1]]
+    assert not np.array_equal(moved, np.eye(4))
+    world.resetBasePositionAndOrientation(crate, [0.2, 0, 0.3], [0, 0, 0, 1])
+    twice = second()["instance_motion"][second.rows[crate, -1]]  # since its own last call
+    np.testing.assert_allclose(twice[:3, 3], 2 * moved[:3, 3], atol=1e-6)
+    seen = third()
+    assert np.array_equal(seen["instance_motion"], np.tile(np.eye(4), (65, 1, 1)))
+    assert set(third.rows) == {(ball, -1)}
+    assert set(np.unique(seen["instance"])) == {0, 1}
 
 
 def test_links_that_pybullet_hides_are_refused(world):
@@ -371,15 +371,6 @@ def test_the_flow_of_soft_bodies_is_unknown(world):
         BulletCamera(world, 60, 40, fov_deg=60, link=(cloth, -1)).reset()
 
 
-def test_a_projection_may_be_a_matrix_of_four_columns(world):
-    numbers = pybullet.computeProjectionMatrix(-0.07, 0.03, -0.02, 0.05, 0.1, 20.0)
-    flat, square = (
-        BulletCamera(world, 60, 40, projection=each, view=VIEW).reset()["depth"]
-        for each in (numbers, np.reshape(numbers, (4, 4)))
-    )
-    assert np.array_equal(flat, square)
-
-
 @pytest.mark.parametrize(
     ("options", "names"),
     [
@@ -414,22 +405,15 @@ def test_invalid_arguments_are_refused_by_name(world, options, names):
 # Envs of others
 
 
-def panda():
-    pytest.importorskip("panda_gym", reason="an env that others wrote: pip install panda-gym")
-    return gym.make("PandaPush-v3")
-
-
-def bullet_env(name):
-    reason = "envs that others wrote: pip install pybullet-envs-gymnasium"
-    pytest.importorskip("pybullet_envs_gymnasium", reason=reason)
+def made(name, package):
+    pytest.importorskip(package, reason="an env that others wrote: pip install '.[examples]'")
     return gym.make(name)
 
 
 def on_hand(env):
-    robot = env.sim._bodies_idx["panda"]
-    return BulletCamera(
-        env.sim.physics_client, WIDTH, HEIGHT, fov_deg=80, link=(robot, env.robot.ee_link)
-    )
+    from examples import pybullet_env
+
+    return pybullet_env.on_hand(env)
 
 
 def chasing(env):
@@ -443,8 +427,8 @@ def chasing(env):
 
 # Each with the number of a body that stands.
 ENVS = {
-    "panda, hand": (panda, on_hand, 2),
-    "ant, chased": (lambda: bullet_env("AntBulletEnv-v0"), chasing, 0),
+    "panda, hand": (partial(made, "PandaPush-v3", "panda_gym"), on_hand, 2),
+    "ant, chased": (partial(made, "AntBulletEnv-v0", "pybullet_envs_gymnasium"), chasing, 0),
 }
 
 
@@ -488,31 +472,31 @@ def test_envs_become_torchrl_envs_with_flow(name):
     env.close()
 
 
+class Sliding(gym.Env):
+    """A box that slides 0.1 m a step. As in pybullet_envs, the first reset makes the client."""
+
+    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+    client = None
+
+    def reset(self, *, seed=None, options=None):
+        if self.client is None:
+            self.client = BulletClient(pybullet.DIRECT)
+            self.box = box(self.client, [0, 0, 0.3])
+        self.x = -0.1
+        return self.step(0)[0], {}
+
+    def step(self, action):
+        self.x += 0.1
+        self.client.resetBasePositionAndOrientation(self.box, [self.x, 0, 0.3], [0, 0, 0, 1])
+        return np.zeros(2, np.float32), 0.0, False, False, {}
+
+
 def test_arrays_of_observations_get_a_name_and_a_name_that_is_taken_is_refused():
-    class Point(gym.Env):
-        observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
-        action_space = gym.spaces.Discrete(2)
+    def camera(env, fov_deg=60):
+        return BulletCamera(env.client, 60, 40, fov_deg=fov_deg, view=VIEW)
 
-        def __init__(self):
-            self.client, self.x = None, 0.0
-
-        def reset(self, *, seed=None, options=None):
-            if self.client is None:  # as pybullet_envs do
-                self.client = BulletClient(pybullet.DIRECT)
-                self.ball = box(self.client, [0, 0, 0.3])
-            self.x = 0.0
-            self.client.resetBasePositionAndOrientation(self.ball, [0, 0, 0.3], [0, 0, 0, 1])
-            return np.zeros(2, np.float32), {}
-
-        def step(self, action):
-            self.x += 0.1
-            self.client.resetBasePositionAndOrientation(self.ball, [self.x, 0, 0.3], [0, 0, 0, 1])
-            return np.zeros(2, np.float32), 0.0, False, False, {}
-
-    def camera(env):
-        return BulletCamera(env.client, 60, 40, fov_deg=60, view=VIEW)
-
-    env = BulletFlow(Point(), camera)
+    env = BulletFlow(Sliding(), camera)
     observation, _ = env.reset(seed=0)
     assert set(observation) == {"observation", "sensor"}
     assert env.observation_space.contains(observation)
@@ -523,9 +507,7 @@ def test_arrays_of_observations_get_a_name_and_a_name_that_is_taken_is_refused()
     with pytest.raises(ValueError, match="'sensor'"):
         BulletFlow(env, camera)
     angles = iter([60, 60, 70])
-    env = BulletFlow(
-        Point(), lambda env: BulletCamera(env.client, 60, 40, fov_deg=next(angles), view=VIEW)
-    )
+    env = BulletFlow(Sliding(), lambda env: camera(env, next(angles)))
     env.reset()
     with pytest.raises(ValueError, match=r"K was .* one size and projection"):
         env.reset()

@@ -1,17 +1,14 @@
 """`python -m flowrep.view` from start to pictures."""
 
 from contextlib import closing
+from functools import partial
 
 import imageio.v3 as imageio
 import pytest
 import torch
 
-pytest.importorskip("pybullet", reason="the command needs the simulator")
-
 from flowrep import files
-from flowrep.config.options import validated
 from flowrep.experiment.film import Film
-from flowrep.experiment.schema import ViewConfig
 from flowrep.scenes import load_scene
 from flowrep.view import (
     FILES,
@@ -23,23 +20,16 @@ from flowrep.view import (
     moving_pixels,
     view,
 )
-from tests.config.composing import plain
+from tests.config.composing import config_of
 from tests.running import run_here
 from tests.test_files import fails
 
+asked = partial(config_of, "view")
 SMALL = ["scene.camera.height_px=24", "scene.camera.width_px=32", "episodes=2", "sheet_rows=2"]
 
 
-def options_of(config):
-    return episodes_of(config, config.scene)
-
-
 def driven(config):
-    return drive_on(config, agent_of(config), options_of(config))
-
-
-def asked(*overrides):
-    return validated(ViewConfig, plain("view", *overrides))
+    return drive_on(config, agent_of(config), episodes_of(config, config.scene))
 
 
 def show(*overrides):
@@ -86,12 +76,17 @@ def test_a_run_drives_in_its_scene_and_a_policy_from_a_file_in_the_one_asked_for
     assert [e.outcome for e in ended[f"{path}:make"]] == [e.outcome for e in never]
 
 
-def test_a_view_has_the_speed_and_the_frame_rate_asked_for():
-    short = "scene=s_turn", "scene.time_limit_steps=12", "episodes=1"
-    (episode,) = driven(asked(*short, "fps=6", "speed=high"))
-    assert (episode.fps, episode.speed) == (6.0, "high")
-    (episode,) = driven(asked(*short, "scene.frame_rate_hz=8"))
-    assert (episode.fps, episode.speed) == (8.0, "normal")
+@pytest.mark.parametrize(
+    ("line", "fps", "speed"),
+    [
+        ("path=eastward fps=6 speed=high", 6.0, "high"),
+        ("path=eastward scene.frame_rate_hz=8", 8.0, "normal"),
+    ],
+)
+def test_a_view_has_the_path_the_speed_and_the_frame_rate_asked_for(line, fps, speed):
+    short = "scene=s_turn", "scene.time_limit_steps=12", "episodes=6"
+    ended = driven(asked(*short, *line.split()))
+    assert [(x.path, x.fps, x.speed) for x in ended] == 6 * [("eastward", fps, speed)]
 
 
 def test_each_scene_and_policy_has_a_folder():
@@ -103,24 +98,21 @@ def test_each_scene_and_policy_has_a_folder():
     assert folder_of(asked("output=here"), scenes[0]).as_posix() == "here"
 
 
-def test_a_view_replaces_the_files_of_an_earlier_one_and_no_others(tmp_path):
+def test_a_view_replaces_the_files_of_an_earlier_one_once_the_disk_has_room_and_no_others(tmp_path):
     for name in (*FILES, "notes.txt"):
         (tmp_path / name).write_text("old")
+
+    def old():
+        return {path.name for path in tmp_path.iterdir() if path.read_bytes() == b"old"}
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(files, "_flush", fails)
+        with pytest.raises(OSError, match=r"sheet\.png"):
+            show("video=false", f"output={tmp_path}")
+    assert old() == {*FILES, "notes.txt"}
     show("video=false", f"output={tmp_path}")
-    left = {path.name for path in tmp_path.iterdir()}
-    assert left == {*FILES, "notes.txt"} - {"episode.mp4"}
-    assert [path.name for path in tmp_path.iterdir() if path.read_bytes() == b"old"] == [
-        "notes.txt"
-    ]
-
-
-def test_a_view_for_which_the_disk_has_no_room_leaves_an_earlier_one(tmp_path, monkeypatch):
-    for name in FILES:
-        (tmp_path / name).write_text("old")
-    monkeypatch.setattr(files, "_flush", fails)
-    with pytest.raises(OSError, match=r"sheet\.png"):
-        show("video=false", f"output={tmp_path}")
-    assert [(tmp_path / name).read_text() for name in FILES] == ["old"] * len(FILES)
+    assert old() == {"notes.txt"}
+    assert {path.name for path in tmp_path.iterdir()} == {*FILES, "notes.txt"} - {"episode.mp4"}
 
 
 def test_a_path_that_the_scene_does_not_have_is_refused_before_a_folder_is_made(
@@ -132,20 +124,9 @@ def test_a_path_that_the_scene_does_not_have_is_refused_before_a_folder_is_made(
     assert not [*tmp_path.iterdir()]
 
 
-def test_every_episode_takes_the_path_asked_for():
-    config = asked("policy=never_turn", "scene=three_way_junction", "path=right", "episodes=6")
-    assert [episode.path for episode in driven(config)] == ["right"] * 6
-
-
-@pytest.mark.parametrize(
-    ("motion", "rows", "expected"),
-    [
-        ([5, 1, 1], 1, [0]),
-        ([1, 2], 6, [0, 1]),  # an episode of fewer frames than rows: each of them once
-    ],
-)
-def test_a_sheet_shows_the_moment_with_most_motion_of_each_part(motion, rows, expected):
-    assert moments(motion, rows) == expected
+def test_a_sheet_shows_the_moment_with_most_motion_of_each_part():
+    assert moments([5, 1, 1], 1) == [0]
+    assert moments([1, 2], 6) == [0, 1]  # fewer frames than rows: each of them once
 
 
 def test_only_moving_pixels_beyond_four_metres_count_for_the_sheet():

@@ -1,6 +1,7 @@
 """Composed configs for tests, each choice of groups composed once."""
 
 import functools
+from pkgutil import resolve_name
 
 from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -9,7 +10,18 @@ from omegaconf import OmegaConf, open_dict
 from flowrep.config import CONF_DIR, config_groups
 from flowrep.config.options import validated
 from flowrep.config.run_names import register_resolvers
-from flowrep.experiment.schema import TrainConfig
+
+SCHEMAS = {
+    "train": "flowrep.experiment.schema:TrainConfig",
+    "evaluate": "flowrep.experiment.schema:EvaluateConfig",
+    "view": "flowrep.experiment.schema:ViewConfig",
+    "factorize": "flowrep.factorize:FactorizeConfig",
+    "report": "flowrep.report.__main__:ReportConfig",
+}
+
+
+def schema_of(command):
+    return resolve_name(SCHEMAS[command])
 
 
 @functools.cache
@@ -38,6 +50,9 @@ def plain(name, *overrides):
     return OmegaConf.to_container(config, resolve=True)
 
 
-def composed(*overrides):
-    """Returns the config of `flowrep.train` as its model."""
-    return validated(TrainConfig, plain("train", *overrides))
+def config_of(command, *overrides):
+    """Returns the config of a command as its model."""
+    return validated(schema_of(command), plain(command, *overrides))
+
+
+composed = functools.partial(config_of, "train")

@@ -5,17 +5,7 @@ import sys
 import pytest
 
 from flowrep.config import cli
-from flowrep.experiment import schema
-from flowrep.factorize import FactorizeConfig
-from flowrep.report.__main__ import ReportConfig
-
-SCHEMAS = {
-    "train": schema.TrainConfig,
-    "evaluate": schema.EvaluateConfig,
-    "factorize": FactorizeConfig,
-    "report": ReportConfig,
-    "view": schema.ViewConfig,
-}
+from tests.config.composing import schema_of
 
 
 @pytest.fixture
@@ -28,7 +18,7 @@ def run(monkeypatch, capsys, tmp_path):
         monkeypatch.setattr(sys, "argv", ["flowrep-train", *arguments])
         code = 0
         try:
-            cli.run_command(command, found.append, SCHEMAS[command])
+            cli.run_command(command, found.append, schema_of(command))
         except SystemExit as end:
             code = end.code
         return code, found, capsys.readouterr()

@@ -4,7 +4,7 @@ import pytest
 
 from flowrep.config import CONF_DIR, cli
 from flowrep.config.usage import UsageError
-from tests.config.conftest import SCHEMAS
+from tests.config.composing import schema_of
 
 WHOLE = "# @package _global_\n"
 REFUSED = {
@@ -41,7 +41,7 @@ def test_a_file_that_leaves_its_group_is_refused_before_anything_runs(run, tmp_p
         (line,) = said.err.splitlines()
         assert "mine" in line
     with pytest.raises(UsageError, match="mine"):
-        cli.composed(SCHEMAS["train"], {"hydra.searchpath": [f"file://{tmp_path}"], group: name})
+        cli.composed(schema_of("train"), {"hydra.searchpath": [f"file://{tmp_path}"], group: name})
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ import pytest
 import torch
 from torch import nn
 
-pytest.importorskip("pybullet", reason="the streets are simulated in PyBullet")
 from examples import distillation
 from flowrep.envs import StreetEnv, make_env
 from flowrep.scenes import load_scene

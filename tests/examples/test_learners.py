@@ -7,17 +7,10 @@ import torch
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("example", "needs"),
-    [
-        ("stable_baselines3_ppo", "stable_baselines3"),
-        ("cleanrl_ppo", "gymnasium"),
-        ("torchrl_ppo", "torchrl"),
-    ],
-)
-def test_the_example_learns_from_representations(example, needs):
-    pytest.importorskip("pybullet", reason="the streets are simulated in PyBullet")
-    pytest.importorskip(needs, reason=f"the example's learner is {needs}'s")
+@pytest.mark.parametrize("example", ["stable_baselines3_ppo", "cleanrl_ppo", "torchrl_ppo"])
+def test_the_example_learns_from_representations(example):
+    if example == "stable_baselines3_ppo":
+        pytest.importorskip("stable_baselines3", reason="the example's learner is of it")
     train = importlib.import_module(f"examples.{example}").train
 
     def weights(steps: int, rollout_length: int) -> list[torch.Tensor]:

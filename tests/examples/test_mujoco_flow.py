@@ -6,6 +6,7 @@ MuJoCo draws in a process of its own: a graphics driver that fails may take its 
 import importlib.util
 import os
 import subprocess
+from contextlib import suppress
 
 import pytest
 import torch
@@ -79,19 +80,13 @@ def draw(*arguments, backend):
     return run_python(*arguments, env=ENVIRONMENT | {"MUJOCO_GL": backend}, timeout=TIMEOUT_S)
 
 
-def can_draw(backend: str) -> bool:
-    try:
-        return draw("-c", PROBE, backend=backend).returncode == 0
-    except subprocess.TimeoutExpired:
-        return False
-
-
 @pytest.fixture(scope="module")
 def backend():
     asked = os.environ.get("MUJOCO_GL")
     for backend in [asked] if asked else ["egl", "osmesa"]:
-        if can_draw(backend):
-            return backend
+        with suppress(subprocess.TimeoutExpired):
+            if draw("-c", PROBE, backend=backend).returncode == 0:
+                return backend
     pytest.skip("MuJoCo can't draw off-screen here: apt-get install libegl1 libgl1-mesa-dri")
 
 

@@ -3,10 +3,6 @@
 import json
 from pathlib import Path
 
-import pytest
-
-pytest.importorskip("pybullet", reason="the notebook's street is simulated in PyBullet")
-
 NOTEBOOK = Path(__file__).parents[2] / "examples" / "raw_ego_obj.ipynb"
 
 

@@ -75,16 +75,3 @@ def test_the_policy_of_ones_own_keeps_clear_of_a_person_and_comes_back(side):
     assert max(way) < 2.5  # and on the road, whose edge is at 3.5 m
     assert abs(way[-1]) < 0.3
     assert abs(math.degrees(state.yaw_rad)) < 1
-
-
-def test_flow_estimated_from_larger_pictures_is_drawn_beside_the_maps():
-    pytest.importorskip("cv2", reason="the example estimates flow: pip install 'flowrep-rl[flow]'")
-    from docs.pictures import SIZE_PX, of_estimates
-
-    still = {"rgb": torch.zeros(3, 2 * SIZE_PX, 2 * SIZE_PX, dtype=torch.uint8)}
-    still["instance_motion"] = torch.eye(4).unsqueeze(0)
-    still["depth"] = torch.ones(1, SIZE_PX, SIZE_PX)
-    now = dict.fromkeys(("obj", "ego"), torch.zeros(2, SIZE_PX, SIZE_PX))
-    drawn = of_estimates(still, still, now, torch.eye(3))
-    assert {picture.shape for picture in drawn.values()} == {(SIZE_PX, SIZE_PX, 3)}
-    assert all((picture == 255).all() for picture in drawn.values())  # no flow is white

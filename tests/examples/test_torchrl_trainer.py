@@ -3,8 +3,6 @@
 import pytest
 import torch
 
-pytest.importorskip("pybullet", reason="the streets are simulated in PyBullet")
-
 from examples.torchrl_trainer import train
 from tests.comparing import differing
 

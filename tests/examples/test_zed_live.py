@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import sys
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
-pytest.importorskip("cv2", reason="recordings need OpenCV")
 
 from examples.zed_live import ZedLive
 from flowrep.sequences import SequenceError
@@ -19,16 +17,13 @@ OK, END, FAILED = "SUCCESS", "END_OF_SVOFILE_REACHED", "CAMERA_NOT_DETECTED"
 class Camera:
     """Gives three pictures; before the second one tracking is lost."""
 
-    opens = OK
-
-    def __init__(self):
-        self.number = -1
-        self.states = ["OK", "SEARCHING", "OK", "OK"]
+    opens, number = OK, -1
+    states = ("OK", "SEARCHING", "OK", "OK")
 
     def open(self, options):
         assert options.coordinate_system == "IMAGE"
         assert options.coordinate_units == "METER"
-        return type(self).opens
+        return self.opens
 
     def enable_positional_tracking(self, options):
         return OK
@@ -45,14 +40,18 @@ class Camera:
 
     def get_position(self, pose, frame):
         assert frame == "WORLD"
-        pose.x_m = 0.5 * self.number
+        matrix = np.eye(4)
+        matrix[0, 3] = 0.5 * self.number
+        pose.pose_data = lambda transform: SimpleNamespace(m=matrix)
         return self.states[self.number]
 
     def retrieve_image(self, mat, view):
-        mat.data = np.full((2, 3, 4), [10, 20, 30, 255], np.uint8)  # blue, green, red, alpha
+        bgra = np.full((2, 3, 4), [10, 20, 30, 255], np.uint8)
+        mat.get_data = lambda: bgra
 
     def retrieve_measure(self, mat, measure):
-        mat.data = np.array([[1.0, np.nan, np.inf], [2.0, 3.0, -np.inf]], np.float32)
+        depth = np.array([[1.0, np.nan, np.inf], [2.0, 3.0, -np.inf]], np.float32)
+        mat.get_data = lambda: depth
 
     def get_timestamp(self, reference):
         return SimpleNamespace(get_nanoseconds=lambda: 2_500_000_000)
@@ -61,42 +60,23 @@ class Camera:
         self.number = None
 
 
-class Pose:
-    x_m = 0.0
-
-    def pose_data(self, transform):
-        matrix = np.eye(4)
-        matrix[0, 3] = self.x_m
-        return SimpleNamespace(m=matrix)
-
-
-class Mat:
-    data = None
-
-    def get_data(self):
-        return self.data
-
-
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def sdk(monkeypatch):
+    objects = "Pose", "Mat", "Transform", "InitParameters", "RuntimeParameters"
     names = {
         "COORDINATE_SYSTEM": ("IMAGE",), "UNIT": ("METER",), "VIEW": ("LEFT",),
         "MEASURE": ("DEPTH",), "REFERENCE_FRAME": ("WORLD",), "TIME_REFERENCE": ("IMAGE",),
         "POSITIONAL_TRACKING_STATE": ("OK",), "ERROR_CODE": (OK, END),
     }  # fmt: skip
     sl = SimpleNamespace(
-        Camera=Camera, Pose=Pose, Mat=Mat, InitParameters=SimpleNamespace,
-        RuntimeParameters=SimpleNamespace, PositionalTrackingParameters=SimpleNamespace,
-        Transform=SimpleNamespace,
-        **{key: SimpleNamespace(**{name: name for name in each}) for key, each in names.items()},
-    )  # fmt: skip
-    pyzed = ModuleType("pyzed")
-    pyzed.sl = sl
-    monkeypatch.setitem(sys.modules, "pyzed", pyzed)
-    return sl
+        Camera=Camera,
+        **dict.fromkeys((*objects, "PositionalTrackingParameters"), SimpleNamespace),
+        **{key: SimpleNamespace(**dict(zip(each, each))) for key, each in names.items()},
+    )
+    monkeypatch.setitem(sys.modules, "pyzed", SimpleNamespace(sl=sl))
 
 
-def test_frames_come_in_flowreps_conventions_and_lost_tracking_starts_a_clip(sdk):
+def test_frames_come_in_flowreps_conventions_and_lost_tracking_starts_a_clip():
     frames = list(ZedLive("live"))
     assert [frame.name for frame in frames] == ["000000", "000001", "000002"]
     assert [frame.clip for frame in frames] == [0, 1, 1]
@@ -108,7 +88,7 @@ def test_frames_come_in_flowreps_conventions_and_lost_tracking_starts_a_clip(sdk
     assert frame.timestamp_s == 2.5
 
 
-def test_a_missing_camera_recording_or_sdk_is_named(sdk, monkeypatch, tmp_path):
+def test_a_missing_camera_recording_or_sdk_is_named(monkeypatch, tmp_path):
     monkeypatch.setattr(Camera, "opens", FAILED)
     with pytest.raises(SequenceError, match=r"^live: can't be opened: the ZED SDK says CAMERA_NOT"):
         list(ZedLive("live"))

@@ -1,18 +1,20 @@
-"""What a config names is checked before it is called."""
+"""What a config names is checked before it is called, and built as it says."""
 
 import sys
 
 import pytest
 import torch
 
-pytest.importorskip("pybullet", reason="a run is built with the simulator")
-
 from flowrep.agent import DoubleDQN, precision
+from flowrep.baselines import BaselinePolicy
 from flowrep.config.algorithms import ALGORITHMS
 from flowrep.config.usage import UsageError
+from flowrep.envs import street_envs
 from flowrep.experiment import build
 from flowrep.experiment.build import algorithm
 from flowrep.experiment.schema import ForeignAlgorithm
+from flowrep.geometry import rigid_flow
+from flowrep.transforms import EstimateCameraMotion
 from tests.config.composing import composed
 
 
@@ -89,44 +91,34 @@ def test_a_target_that_is_no_algorithm_is_refused(target, options, says):
         algorithm(named(target, **options))
 
 
-@pytest.mark.parametrize(
-    ("cores", "device", "change", "workers"),
-    [
-        (1, "cpu", "motion=exact", 0),
-        (2, "cpu", "threads=1", 1),
-        (2, "cpu", "threads=2", 0),
-        (2, "cpu", "num_workers=2", 2),
-        (2, "cuda", "motion=exact", 2),
-        (3, "cpu", "threads=1", 2),
-        (16, "cpu", "threads=1", 4),  # one for each environment
-    ],
-)
-def test_workers_step_a_training_s_envs_where_cores_are_free(
-    monkeypatch, cores, device, change, workers
-):
-    monkeypatch.setattr("flowrep.experiment.build.available_cores", lambda: cores)
-    config = composed(change, "num_envs=4", "algorithm.batch_size=64")
-    assert build.training_workers(config, torch.device(device)) == workers
+@pytest.fixture
+def cores(monkeypatch):
+    """Sets how many cores the machine has."""
+    return lambda n: monkeypatch.setattr("flowrep.experiment.build.available_cores", lambda: n)
 
 
-@pytest.mark.parametrize(
-    ("cores", "asked", "num_envs", "workers"),
-    [
-        (2, "auto", 96, 2),
-        (2, "auto", 47, 0),  # one process would have fewer than 24
-        (16, "auto", 96, 4),
-        (1, "auto", 96, 0),
-        (2, 0, 96, 0),
-        (2, 3, 96, 3),
-        (2, 3, 2, 2),  # the last episodes of many workers
-    ],
-)
-def test_an_evaluation_is_stepped_by_a_process_a_core_if_each_has_enough_to_do(
-    monkeypatch, cores, asked, num_envs, workers
-):
-    monkeypatch.setattr("flowrep.experiment.build.available_cores", lambda: cores)
-    config = composed("device=cpu").model_copy(update={"num_workers": asked})
-    assert build.evaluation_workers(config, num_envs) == workers
+def test_workers_step_a_training_s_envs_where_cores_are_free(cores):
+    def workers(available, change="threads=1", device="cpu"):
+        cores(available)
+        config = composed(change, "num_envs=4", "algorithm.batch_size=64")
+        return build.training_workers(config, torch.device(device))
+
+    assert [workers(n) for n in (1, 2, 3, 16)] == [0, 1, 2, 4]  # one for each environment
+    assert workers(2, "threads=2") == 0
+    assert workers(2, "num_workers=2") == 2
+    assert workers(2, device="cuda") == 2
+
+
+def test_an_evaluation_is_stepped_by_a_process_a_core_if_each_has_enough_to_do(cores):
+    def workers(available, num_envs, asked="auto"):
+        cores(available)
+        config = composed("device=cpu").model_copy(update={"num_workers": asked})
+        return build.evaluation_workers(config, num_envs)
+
+    assert [workers(n, 96) for n in (1, 2, 16)] == [0, 2, 4]
+    assert workers(2, 47) == 0  # one process would have fewer than 24
+    assert [workers(2, 96, asked) for asked in (0, 3)] == [0, 3]
+    assert workers(2, 2, 3) == 2  # the last episodes of many workers
 
 
 @pytest.mark.parametrize(
@@ -145,3 +137,24 @@ def test_what_a_transform_or_a_machine_refuses_is_named_before_a_run_has_a_folde
     key = line.split()[0].partition("=")[0].rpartition(".")[2].lstrip("+")
     with pytest.raises(ValueError, match=key):
         build.resolved(composed(*line.split()))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("motion", ["exact", "estimated"])
+def test_with_the_camera_compensated_what_stands_still_has_hardly_any_object_flow(motion):
+    options = ["preset=laptop", "flow=estimated", f"motion={motion}", "representations=[ego,obj]"]
+    options += ["num_envs=2", "num_workers=0", "device=cpu"]
+    env = build.env(composed(*options), keep_sensor=True, seed=0)
+    estimators = [each for each in env.transform if isinstance(each, EstimateCameraMotion)]
+    assert len(estimators) == (motion == "estimated")
+    planner, streets = BaselinePolicy("planner"), torch.arange(2)
+    planner.enter(env)
+    frames = env.rollout(24, lambda td: planner(td.set("env_id", streets)))["next"]
+    K, sensor = torch.as_tensor(street_envs(env)[0].K).float(), frames["sensor"]
+    env.close()
+    depth, ids, motions = (sensor[key] for key in ("depth", "instance", "instance_motion"))
+    exact = (rigid_flow(depth, ids, K, motions).flow - frames["ego"]).norm(dim=-3, keepdim=True)
+    moved = frames["obj"].norm(dim=-3, keepdim=True)
+    static = (ids == 0) & depth.isfinite()
+    assert (moved[static] > 1.0).float().mean() < 0.01  # 0.1 without
+    assert moved[exact > 0.5].median() > 0.5

@@ -5,8 +5,6 @@ import pytest
 import torch
 from torchrl.data import Bounded
 
-pytest.importorskip("pybullet", reason="the simulated street is driven")
-
 from flowrep.experiment.agents import Agent
 from flowrep.experiment.film import Film, record_episode
 from flowrep.transforms import Depth
@@ -22,9 +20,9 @@ def leave_the_road(tensordict):
 def film_of(close_later):
     """Films an agent of a config that leaves the road to the left; closed when the test ends."""
 
-    def film_of(*overrides, policy=leave_the_road):
-        small = "debug=smoke", "device=cpu"
-        return close_later(Film(Agent(policy, composed(*small, *overrides))))
+    def film_of(*overrides, **changes):
+        config = composed("debug=smoke", "device=cpu", *overrides).model_copy(update=changes)
+        return close_later(Film(Agent(leave_the_road, config)))
 
     return film_of
 
@@ -90,17 +88,10 @@ def test_filming_does_not_change_what_the_agent_estimates(film_of):
     env.close()
 
 
-@pytest.mark.parametrize(
-    ("representation", "flow", "rgb"),
-    [
-        ("seg", "exact", (200, 240)),  # five times the maps, as large as a film's tiles
-        ("rgb", "exact", (40, 48)),  # the agent sees it
-        ("obj", "estimated", (160, 192)),  # flow is estimated from pictures of four times the size
-    ],
-)
-def test_the_picture_is_as_large_as_a_tile_unless_it_is_read(film_of, representation, flow, rgb):
-    film = film_of(f"representations=[{representation}]", f"flow={flow}")
-    assert film.env.observation_spec["sensor", "rgb"].shape == (1, 3, *rgb)
+def test_the_picture_is_as_large_as_a_tile_unless_it_is_read(film_of):
+    for name, size in (("seg", (200, 240)), ("rgb", (40, 48))):  # maps of 40 x 48, five times
+        film = film_of(f"representations=[{name}]")
+        assert film.env.observation_spec["sensor", "rgb"].shape == (1, 3, *size)
 
 
 def test_the_last_picture_shows_the_outcome_in_its_colour(film_of):
@@ -108,14 +99,10 @@ def test_the_last_picture_shows_the_outcome_in_its_colour(film_of):
     frames, episode = film.drive({"episode_seed": 3})
     pictures = list(film.pictures(frames, episode))
     assert len(pictures) == episode.length + 12  # the last frame for a second
-    assert {picture.shape for picture in pictures} == {pictures[0].shape}
     assert all((picture == pictures[-1]).all() for picture in pictures[-12:])
-    colour = tuple(bytes.fromhex(OUTCOME_COLOURS["out_of_bounds"][1:]))
-    has_it = [tuple(picture[-3, -3]) == colour for picture in pictures]
+    colour = [*bytes.fromhex(OUTCOME_COLOURS["out_of_bounds"][1:])]
+    has_it = [(picture == colour).all(axis=-1).any() for picture in pictures]
     assert has_it == [False] * (len(pictures) - 12) + [True] * 12
-    # what is above it is the frame in which the episode ended
-    bare = film.draw(frames[-1])
-    assert (pictures[-1][:-28] == bare[:-28]).all()
 
 
 def test_each_frame_of_a_stack_has_a_tile(film_of):
@@ -126,8 +113,6 @@ def test_each_frame_of_a_stack_has_a_tile(film_of):
     for name in ("depth", "seg"):  # oldest first; the newest is the exact one here
         torch.testing.assert_close(now[f"{name}2, 1 of 2"], before[name])
         torch.testing.assert_close(now[f"{name}2, 2 of 2"], now[name])
-    # ten tiles of 240 px, with 5 px around each and 4 px between
-    assert film.draw(frames[5]).shape[1] == 10 * 250 + 9 * 4
 
 
 class Nearness(Depth):
@@ -142,18 +127,15 @@ class Nearness(Depth):
         return (Bounded(0.0, 1.0, shape=shape, device=depth.device, dtype=torch.float32),)
 
 
-def test_a_representation_of_a_user_is_drawn_in_grey():
-    config = composed("debug=smoke", "device=cpu")
+def test_a_representation_of_a_user_is_drawn_in_grey(film_of):
     own = {"near": {"_target_": f"{__name__}.Nearness", "range_m": 50.0}}
-    agent = Agent(leave_the_road, config.model_copy(update={"representations": own}))
-    film = Film(agent)
+    film = film_of(representations=own)
     frames, _ = film.drive({"episode_seed": 3})
     assert film.framed == ["near, 1 of 2", "near, 2 of 2"]
     drawn = [film.tiles[name].draw(frames[5].maps[name]) for name in film.framed]
     near = 1 / frames[5].maps["depth"][0].clamp(min=1.0).numpy()
     for image, shares in zip(drawn, (near, near**2)):
         assert np.abs(image[..., 0] - 255 * shares)[near > 0.011].max() <= 0.51
-    film.close()
 
 
 @pytest.mark.slow

@@ -10,14 +10,12 @@ from contextlib import suppress
 
 import pytest
 
-pytest.importorskip("pybullet", reason="training drives the simulated street")
-
 from flowrep.agent import load_checkpoint
 from flowrep.experiment.run import RunFolder
 from tests.comparing import differing
 from tests.config.composing import plain
-from tests.experiment.test_runner import without_clock
-from tests.running import ENVIRONMENT
+from tests.experiment.test_runner import CLOCK, without_clock
+from tests.running import ENVIRONMENT, glossary
 
 pytestmark = pytest.mark.slow
 
@@ -88,6 +86,8 @@ def test_a_run_killed_again_and_again_ends_bit_for_bit_as_one_that_was_not(
     rows = without_clock(run.read_metrics())
     assert rows == without_clock(whole.read_metrics())
     assert [int(row["frames"]) for row in rows] == list(range(4, 49, 4))
+    assert all(any(row[name] != "nan" for row in rows) for name in rows[0])
+    assert {*rows[0], *CLOCK} <= glossary()
     assert run.read_episodes() == whole.read_episodes()
 
 

@@ -1,9 +1,9 @@
 """A checkpoint belongs to its run's config and version; the machine is noted."""
 
-import copy
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 
 from flowrep.agent import CheckpointError
 from flowrep.experiment.provenance import check_origin, machine_of, origin_of
@@ -34,14 +34,10 @@ def test_the_same_run_on_another_machine_is_the_same(config):
     ],
 )
 def test_an_edited_config_is_refused_by_the_name_of_the_key(config, place, value, says):
-    edited = copy.deepcopy(config)
-    *path, key = place.split(".")
-    node = edited
-    for part in path:
-        node = node[part]
-    node[key] = value
+    edited = OmegaConf.create(config)
+    OmegaConf.update(edited, place, value)
     with pytest.raises(CheckpointError, match=f"{PATH} belongs to a run with {says}"):
-        check_origin(origin_of(config), origin_of(edited), PATH)
+        check_origin(origin_of(config), origin_of(OmegaConf.to_container(edited)), PATH)
 
 
 def test_another_version_is_refused(config):

@@ -3,7 +3,7 @@
 import json
 import multiprocessing
 import time
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
 
 import numpy as np
@@ -53,13 +53,10 @@ def test_metrics_and_means_of_evaluations_go_to_tensorboard(tmp_path):
     """Two of four succeed; returns 1, 2, 3 and 10, lengths 10, 20, 30 and 60."""
     run = RunFolder(tmp_path)
     run.log_metrics(10, {"alpha": 0.5})
-    same = {"scene": "s_turn", "evaluation": "training", "policy": "greedy", "frames": 500}
+    same = {"scene": "s_turn", "evaluation": "training", "policy": "greedy", "speed": "normal"}
     ends = [("success", 1, 10), ("timeout", 2, 20), ("collision", 3, 30), ("success", 10, 60)]
     run.log_episodes(
-        [
-            episode(k, outcome, return_=total, length=length, speed="normal", **same)
-            for k, (outcome, total, length) in enumerate(ends)
-        ]
+        [episode(1, end, return_=x, length=n, frames=500, **same) for end, x, n in ends]
     )
     run.flush()
     events = EventAccumulator(str(next(tmp_path.rglob("events.out.tfevents.*"))))
@@ -129,18 +126,15 @@ def test_a_run_notes_each_machine_with_its_first_start_and_its_last_end(tmp_path
     assert here["precision"] == "bfloat16"
     assert here["cpu"]
     assert here["commit"] or here["flowrep"]
-    clock = iter(range(10, 14))
-    with monkeypatch.context() as patched:
-        now = SimpleNamespace(now=lambda _: datetime(2026, 1, 1, next(clock), tzinfo=UTC))
-        patched.setattr("flowrep.experiment.run.datetime", now)
-        for machine in (here, here, here | {"cpu": "another"}, here):
-            run.log_machine(machine)
+    another, noon = here | {"cpu": "another"}, datetime(2026, 1, 1, 12, tzinfo=UTC)
+    for hours, machine in enumerate((here, here, another, here)):
+        clock = SimpleNamespace(now=lambda _, hours=hours: noon + timedelta(hours=hours))
+        monkeypatch.setattr("flowrep.experiment.run.datetime", clock)
+        run.log_machine(machine)
     noted = json.loads((tmp_path / "machine.json").read_text())
-    times = [tuple(each.pop(k)[11:] for k in ("started", "ended")) for each in noted]
-    assert noted == [here, here | {"cpu": "another"}, here]
-    assert times == [
-        ("10:00:00+00:00", "11:00:00+00:00"), *[(f"{h}:00:00+00:00",) * 2 for h in (12, 13)]
-    ]  # fmt: skip
+    times = [[int(each.pop(key)[11:13]) for key in ("started", "ended")] for each in noted]
+    assert noted == [here, another, here]
+    assert times == [[12, 13], [14, 14], [15, 15]]
 
 
 def test_a_folder_without_a_run_is_named(tmp_path):

@@ -12,12 +12,11 @@ from flowrep.agent import CheckpointError, DivergenceError, load_checkpoint, sav
 from flowrep.config.usage import UsageError
 from flowrep.experiment import build
 from flowrep.experiment.run import RunFolder, RunFolderError
-from flowrep.experiment.runner import Every, Means, RecentEpisodes, Runner, progress_text
+from flowrep.experiment.runner import Every, Means, RecentEpisodes, Runner
 from flowrep.progress import StopRequest
 from flowrep.train import resumed, run_in_folder
 from tests.comparing import differing
 from tests.config.composing import composed, plain
-from tests.running import glossary
 
 RUNNING, SUCCESS, COLLISION = 0, 1, 2
 
@@ -48,28 +47,22 @@ def test_every_fires_once_for_each_multiple_that_a_jump_passes():
     assert Every(100, last=130)(201)
 
 
-def test_episodes_of_each_street_are_summed_up_apart():
-    recent = RecentEpisodes()
+def test_episodes_of_each_street_are_summed_up_apart_also_across_a_checkpoint():
+    recent, resumed = RecentEpisodes(), RecentEpisodes()
     assert all(math.isnan(value) for value in recent.summary().values())
-    for each in STEPS:
+    for number, each in enumerate(STEPS):
+        if number == 2:
+            resumed.restore(recent.state())
         recent.add(each)
+        if number >= 2:
+            resumed.add(each)
     summary = recent.summary()
     assert summary["success"] == pytest.approx(2 / 3)
     assert summary["collision"] == pytest.approx(1 / 3)
     assert summary["out_of_bounds"] == summary["timeout"] == 0.0
     assert summary["return"] == pytest.approx((30 + 7 + 120) / 3)
     assert summary["length"] == pytest.approx((2 + 3 + 2) / 3)
-
-
-def test_episodes_that_run_across_a_checkpoint_are_summed_up_whole():
-    before, after = RecentEpisodes(), RecentEpisodes()
-    for each in STEPS[:2]:
-        before.add(each)
-    after.restore(before.state())
-    for each in STEPS[2:]:
-        before.add(each)
-        after.add(each)
-    assert after.summary() == before.summary()
+    assert resumed.summary() == summary
 
 
 def test_only_the_last_hundred_episodes_count():
@@ -101,20 +94,12 @@ def test_updates_on_a_gpu_go_on_with_sums_from_a_file():
         assert means.state()["sums"]["q_loss"].device.type == "cuda"
 
 
-pytest.importorskip("pybullet", reason="training drives the simulated street")
-
-SMALL = {"ppo": ["algorithm.rollout_length=16"]}
-
-
-def new_run(
-    folder, *, resume=False, algorithm="dsac", noise="none", num_workers=0, more=()
-) -> Runner:
-    small = SMALL.get(algorithm, ["algorithm.replay_capacity=64"])
+def new_run(folder, *more, resume=False) -> Runner:
     config = composed(
         "debug=smoke", "num_envs=2", "total_frames=120", "checkpoint_every_frames=60",
         "log_every_frames=20", "evaluation.every_frames=0", "algorithm.precision=fp32",
-        "device=cpu", "seed=7", f"algorithm={algorithm}", f"noise={noise}",
-        f"num_workers={num_workers}", *small, *more,
+        "algorithm.replay_capacity=64", "device=cpu", "seed=7", "noise=depth_camera",
+        "num_workers=0", *more,
     )  # fmt: skip
     folder.mkdir(exist_ok=True)
     runner = Runner(config, RunFolder(folder))
@@ -132,7 +117,7 @@ def trained(runner: Runner, stop: StopRequest | None = None) -> Runner:
 def test_the_config_says_whether_flow_is_compiled(tmp_path, monkeypatch):
     made, asked = build.env, []
     monkeypatch.setattr(build, "env", lambda *of, **with_: asked.append(with_) or made(*of))
-    new_run(tmp_path, more=["compiled=true"]).close()
+    new_run(tmp_path, "compiled=true").close()
     assert [each["compiled"] for each in asked] == [True]
 
 
@@ -166,20 +151,20 @@ def test_a_run_that_can_not_be_resumed_has_not_become_longer(tmp_path):
 
 
 def test_updates_use_the_threads_of_the_config_and_all_else_one(tmp_path):
-    runner = new_run(tmp_path, more=["threads=2"])
+    runner = new_run(tmp_path, "threads=2")
     used, act, update = [], runner.agent.act, runner.agent.update
     runner.agent.act = lambda *of: used.append(("act", torch.get_num_threads())) or act(*of)
     runner.agent.update = lambda *of: used.append(("up", torch.get_num_threads())) or update(*of)
-    trained(runner, StopAfter(runner, 28))
+    trained(runner, stop_after(runner, 28))
     assert {*used} == {("act", 1), ("up", 2)}
 
 
 def test_a_machine_that_emulates_the_run_s_number_format_says_so(tmp_path, monkeypatch, capsys):
-    given = {"resume": True, "more": ["algorithm.precision=bf16"]}
-    trained(new_run(tmp_path, more=given["more"]), lambda: True)
+    bf16 = "algorithm.precision=bf16"
+    trained(new_run(tmp_path, bf16), lambda: True)
     for is_there in (True, False):
         monkeypatch.setattr("flowrep.experiment.runner.has_bf16", lambda device, i=is_there: i)
-        new_run(tmp_path, **given).close()
+        new_run(tmp_path, bf16, resume=True).close()
         assert ("bf16" in capsys.readouterr().out) is not is_there
 
 
@@ -199,46 +184,18 @@ def copied(finished, tmp_path):
 def test_a_finished_run_is_made_longer_and_its_learning_rate_follows(finished, copied):
     assert finished.agent.updates == (120 - 16) // 10  # one for ten frames after the first batch
     assert float(logged(finished)[-1]["learning_rate"]) < 3e-4 / 5
-    rows = logged(trained(new_run(copied, resume=True, more=["total_frames=240"])))
+    rows = logged(trained(new_run(copied, "total_frames=240", resume=True)))
     assert [int(row["frames"]) for row in rows] == list(range(20, 241, 20))
     assert float(rows[6]["learning_rate"]) == pytest.approx(3e-4 * 0.5, rel=0.2)
     assert float(rows[-1]["learning_rate"]) < 3e-4 / 10
 
 
-class StopAfter(StopRequest):
-    """A stop that is asked for once a number of frames is reached."""
+def stop_after(runner: Runner, frames: int) -> StopRequest:
+    class Stop(StopRequest):
+        def __bool__(self) -> bool:
+            return runner.frames >= frames
 
-    def __init__(self, runner: Runner, frames: int) -> None:
-        super().__init__()
-        self.runner, self.frames = runner, frames
-
-    def __bool__(self) -> bool:
-        return self.runner.frames >= self.frames
-
-
-def finish(folder, *stops: int, **how) -> Runner:
-    """Trains in as many sessions as there are stops, and one more."""
-    for stop in stops:
-        runner = new_run(folder, resume=(folder / "checkpoint").exists(), **how)
-        trained(runner, StopAfter(runner, stop))
-    return trained(new_run(folder, resume=bool(stops), **how))
-
-
-def saved(runner):
-    """The last state of a run."""
-    return load_checkpoint(runner.folder.checkpoint_path)
-
-
-@pytest.mark.slow
-def test_the_number_of_worker_processes_does_not_change_a_run(finished, tmp_path, monkeypatch):
-    monkeypatch.setattr("flowrep.envs.torchrl_env.available_cores", lambda: 64)
-    first = new_run(tmp_path / "two", num_workers=2)  # which step while updates are taken
-    trained(first, StopAfter(first, 50))
-    monkeypatch.setattr("flowrep.envs.torchrl_env.available_cores", lambda: 1)
-    second = new_run(tmp_path / "two", resume=True, num_workers=1)
-    second.train(StopRequest())
-    assert differing(saved(finished), saved(second)) == []
-    second.close()
+    return Stop()
 
 
 CLOCK = {"frames_per_second", "share_outside_updates"}
@@ -253,17 +210,18 @@ def logged(runner):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", ["dsac", "ppo"])  # from a replay memory and from rollouts
-def test_a_resumed_run_equals_the_uninterrupted_one_bit_for_bit(tmp_path, algorithm):
-    whole = finish(tmp_path / "whole", algorithm=algorithm, noise="depth_camera")
-    pieces = finish(tmp_path / "pieces", 50, algorithm=algorithm, noise="depth_camera")
-    assert whole.agent.updates == pieces.agent.updates > 5
-    assert differing(saved(whole), saved(pieces)) == []
-    rows = logged(whole)
-    assert rows == logged(pieces)
-    assert len(rows) == 6
-    assert all(any(row[name] != "nan" for row in rows) for name in rows[0])
-    assert {*rows[0], *CLOCK} <= glossary()
+def test_a_resumed_run_equals_the_uninterrupted_one_bit_for_bit_by_any_number_of_workers(
+    finished, tmp_path, monkeypatch
+):
+    """From a replay memory; rollouts are in test_kills.py."""
+    monkeypatch.setattr("flowrep.envs.torchrl_env.available_cores", lambda: 64)
+    first = new_run(tmp_path, "num_workers=2")  # which step while updates are taken
+    trained(first, stop_after(first, 50))
+    monkeypatch.setattr("flowrep.envs.torchrl_env.available_cores", lambda: 1)
+    second = trained(new_run(tmp_path, "num_workers=1", resume=True))
+    states = (load_checkpoint(each.folder.checkpoint_path) for each in (finished, second))
+    assert differing(*states) == []
+    assert logged(finished) == logged(second)
 
 
 @pytest.mark.slow
@@ -304,43 +262,28 @@ def test_an_evaluation_that_was_cut_short_is_repeated_after_a_resume(tmp_path):
             return not stop.is_asked
 
     for session in range(2):
-        runner = new_run(tmp_path, resume=session > 0, more=["evaluation.every_frames=30"])
+        runner = new_run(tmp_path, "evaluation.every_frames=30", resume=session > 0)
         runner.__class__ = Evaluated
         trained(runner, Stop())
     assert asked == [30, 60, 60, 90, 120]
 
 
-def poison(runner, updates):
-    """Makes Q infinite once so many updates were taken."""
+@pytest.mark.slow
+def test_a_loss_that_is_no_number_ends_the_run_before_it_is_saved(tmp_path):
+    runner = new_run(tmp_path, "log_every_frames=1000")
     losses = runner.agent.losses
 
-    def poisoned(batch):
-        factor = math.inf if runner.agent.updates == updates else 1.0
+    def poisoned(batch):  # the eighth update is after the checkpoint at 60 frames
+        factor = math.inf if runner.agent.updates == 7 else 1.0
         return losses(batch) | {"q_loss": losses(batch)["q_loss"] * factor}
 
     runner.agent.losses = poisoned
-
-
-@pytest.mark.slow
-def test_a_loss_that_is_no_number_ends_the_run_before_it_is_saved(tmp_path):
-    runner = new_run(tmp_path, more=["log_every_frames=1000"])
-    poison(runner, updates=7)  # after the checkpoint at 60 frames
     with pytest.raises(DivergenceError, match=f"q_loss.*{runner.folder.checkpoint_path}"):
         runner.train(StopRequest())
     runner.close()
     resumed = new_run(tmp_path, resume=True)
     assert resumed.frames == 60
     assert trained(resumed).agent.updates == 10
-
-
-@pytest.mark.slow
-def test_a_loss_that_is_no_number_from_the_start_leaves_no_checkpoint(tmp_path):
-    runner = new_run(tmp_path)
-    poison(runner, updates=0)
-    with pytest.raises(DivergenceError, match="update 1 "):
-        runner.train(StopAfter(runner, 50))
-    runner.close()
-    assert not runner.folder.checkpoint_path.exists()
 
 
 @pytest.mark.slow
@@ -354,14 +297,8 @@ def test_a_loss_that_is_no_number_from_the_start_leaves_no_checkpoint(tmp_path):
 def test_a_run_ends_by_naming_the_map_or_loss_that_leaves_no_probabilities(tmp_path, change, what):
     more = ["total_frames=400", "log_every_frames=400", "representations=[ego]"]
     more += ["algorithm.batch_size=8", "algorithm.frames_per_update=2", change]
-    runner = new_run(tmp_path, more=more)
+    runner = new_run(tmp_path, *more)
     with pytest.raises(DivergenceError, match=what):
         runner.train(StopRequest())
     assert runner.frames < 400  # before the first look at the losses
     runner.close()
-
-
-def test_the_progress_line_has_what_fits_beside_the_bar():
-    row = {"success": 0.21, "alpha": 0.004991, "entropy": math.nan, "q_loss": 0.7812}
-    row |= {"actor_loss": 1.13, "alpha_loss": 0.112}
-    assert progress_text(row) == "success 21%, alpha 0.00499, q loss 0.781"

@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import time
-from concurrent.futures.process import BrokenProcessPool
 
 import pytest
 import yaml
@@ -15,9 +14,8 @@ from flowrep import sweep
 from flowrep.config import cli, group_choices
 from flowrep.config.usage import UsageError
 from flowrep.experiment.outcomes import COLUMNS, is_finished
-from flowrep.experiment.schema import TrainConfig
 from flowrep.files import open_to_append, read_rows, write_rows
-from tests.config.composing import composed, plain
+from tests.config.composing import composed, plain, schema_of
 from tests.running import ENVIRONMENT, run_here
 
 
@@ -111,29 +109,15 @@ def test_a_folder_with_another_run_is_not_taken_for_the_one_asked_for(attempt, t
             attempt(config=CONFIG.model_copy(update=other))
 
 
-@pytest.mark.parametrize(
-    ("end", "state"),
-    [
-        ("--- begun 2026-01-31 12:00:00\nrun folder: x\n", "stopped"),
-        ("--- begun 2026-01-31 12:00:00\n", "stopped"),
+def test_the_last_line_of_a_log_says_how_its_run_ended(tmp_path):
+    log, begun = tmp_path / "job.log", "--- begun 2026-01-31 12:00:00\n"
+    for end, state in (
+        (begun, "stopped"),
+        (f"{begun}run folder: x\n", "stopped"),
         ("saved\n--- failed: error: no space\n", "failed: error: no space"),
-    ],
-)
-def test_the_last_line_of_a_log_says_how_its_run_ended(tmp_path, end, state):
-    (tmp_path / "job.log").write_text(f"--- finished, success 3%\n{end}")
-    assert sweep.state_of(tmp_path / "job.log") == state
-
-
-def test_a_killed_worker_of_a_launcher_is_no_traceback(monkeypatch, tmp_path, capsys):
-    def killed(config):
-        raise BrokenProcessPool("A worker process was unexpectedly terminated")
-
-    monkeypatch.setattr(sys, "argv", ["train", "-m", f"hydra.sweep.dir={tmp_path}"])
-    with pytest.raises(SystemExit):
-        cli.run_hydra("train", killed, TrainConfig)
-    said = capsys.readouterr().err
-    assert "error: A worker process" in said
-    assert "Traceback" not in said
+    ):
+        log.write_text(f"--- finished, success 3%\n{end}")
+        assert sweep.state_of(log) == state
 
 
 @pytest.mark.parametrize(
@@ -175,7 +159,7 @@ def test_an_experiment_has_a_run_for_each_stack(monkeypatch, tmp_path):
     # typed, a scene and a seed replace the four and the three of the experiment
     line = ["experiment=flow_composition", "preset=laptop", "scene=s_turn", "seed=7"]
     monkeypatch.setattr(sys, "argv", ["train", "-m", f"hydra.sweep.dir={tmp_path}", *line])
-    cli.run_hydra("train", job, TrainConfig)
+    cli.run_hydra("train", job, schema_of("train"))
     stacks = ["[ego]", "[raw]", "[obj]", "[ego,obj]"]
     assert sorted(run.pop("representations") for run in found) == sorted(stacks)
     typed = dict(text.split("=") for text in line)

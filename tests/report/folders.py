@@ -5,8 +5,6 @@ import yaml
 from flowrep.experiment.outcomes import COLUMNS
 from flowrep.files import write_rows
 
-EPISODES = 8
-
 
 def config_of(scene="straight_road", stack="ego+obj", seed=0, **changes):
     """A run's config, as little of it as a report reads."""
@@ -70,6 +68,6 @@ def run_in(folder, name, outcomes=4, **changes):
     return write_run(folder / name, config, rows)
 
 
-def letters(successes, episodes=EPISODES, rest="c"):
+def letters(successes, episodes=8, rest="c"):
     """Outcomes of which the first are successes and the others `rest`."""
     return "s" * successes + rest * (episodes - successes)

