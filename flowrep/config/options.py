@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping
+from functools import cache
 from typing import Annotated, Any, Literal, TypeVar, get_type_hints
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, create_model
@@ -99,13 +100,18 @@ def check_reader_options(reader: type, options: Mapping[str, Any]) -> None:
     # Not ???, which would not replace the value of the format that this one extends.
     for key in [key for key, value in options.items() if value == "needed"]:
         raise UsageError(f"format.{key} needs a value: format.{key}=...")
+    validated(_section(reader), {"format": options})
+
+
+@cache  # the model takes longer to make than its check
+def _section(reader: type) -> type[BaseModel]:
     hints = get_type_hints(reader.__init__, include_extras=True)  # type: ignore[misc]
     _, *parameters = inspect.signature(reader).parameters.values()
     fields: dict[str, Any] = {
         p.name: (hints[p.name], ... if p.default is p.empty else p.default) for p in parameters
     }
     section: Any = create_model(reader.__name__, __base__=Options, **fields)
-    validated(create_model("Config", format=(section, ...)), {"format": options})
+    return create_model("Config", format=(section, ...))
 
 
 def _key(details: Any) -> str:
