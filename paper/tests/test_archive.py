@@ -18,10 +18,8 @@ def test_packed_runs_are_the_runs_of_the_folders(tmp_path):
     config = config_of("s_turn", "raw")
     metrics = [{"frames": 123456, "success": ""}, {"frames": 200000, "success": 0.25}]
     write_run(tmp_path / "runs" / "a", config, rows_of(config, "sct", fps=6.5), metrics)
-    machines = [
-        {"commit": "abc", "precision": "bfloat16", "started": "1", "ended": "2"},
-        {"commit": "abc", "precision": "float32", "started": "3", "ended": "4"},
-    ]
+    machine = {"commit": "abc", "precision": "bfloat16", "started": "1", "ended": "2"}
+    machines = [machine, machine | {"precision": "float32", "started": "3", "ended": "4"}]
     path = run_in(tmp_path / "runs", "b", seed=1) / "machine.json"
     path.write_text(json.dumps(machines))
     folders, _ = read_runs([tmp_path / "runs"])

@@ -1,4 +1,4 @@
-"""Is Straight Road a fair task? A small count here; `examples/scene_validity.py` has the rest."""
+"""The baselines' names, and the planner; what they achieve in the scenes is in test_scenes.py."""
 
 from itertools import product
 from typing import get_args
@@ -14,18 +14,6 @@ from flowrep.config.options import BaselineName
 
 def test_the_commands_know_every_baseline():
     assert set(BASELINES) == set(get_args(BaselineName))
-
-
-@pytest.mark.slow_after_first
-@pytest.mark.parametrize("speed", ["low", "normal", "high"])
-def test_the_planner_succeeds_and_never_turning_and_random_actions_seldom_do(drive, speed):
-    assert [e.outcome for e in drive("planner", 5, speed=speed)] == ["success"] * 5
-    # With 60 episodes a true share of 12 % gives more than 15 in less than one run in 1,000.
-    straight = [e.outcome for e in drive("never_turn", 60, speed=speed)]
-    assert straight.count("success") <= 15
-    assert set(straight) <= {"success", "collision"}
-    by_chance = [e.outcome for e in drive("random", 60, speed=speed)]
-    assert by_chance.count("success") <= 6
 
 
 def test_the_planner_replans_after_other_actions(make_street, empty_road):

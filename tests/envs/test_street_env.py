@@ -12,6 +12,7 @@ import torch
 from flowrep.envs import StreetEnv
 from flowrep.envs.street_env import ticks_for
 from flowrep.scenes.scene import Obstacle
+from tests.comparing import differing
 
 NO_OP, LEFT, RIGHT = 0, 1, 2
 
@@ -25,10 +26,6 @@ def drive(env, action=NO_OP, **options):
         assert not truncated
         rewards.append(reward)
     return rewards, info
-
-
-def same(a, b):
-    return a.keys() == b.keys() and all(np.array_equal(a[key], b[key]) for key in a)
 
 
 def test_the_observation_has_the_requested_sensors(make_street, straight_road):
@@ -47,7 +44,6 @@ def test_the_observation_has_the_requested_sensors(make_street, straight_road):
     observation, _ = env.reset(seed=0)
     seen = {key: (value.shape, value.dtype.name) for key, value in observation.items()}
     assert list(seen.items()) == list(asked.items())
-    assert env.K.shape == (3, 3)
     assert [*make_street(straight_road, sensors="depth").observation_space] == ["depth"]
 
 
@@ -82,40 +78,28 @@ def test_maps_show_sky_road_sidewalk_houses_and_people(make_street):
     assert depth[-1, 42] == pytest.approx(z, rel=1e-4)
 
 
-def test_the_vehicle_sees_nothing_of_itself(make_street, empty_road):
-    behind = replace(empty_road.camera, mount_forward_m=-3.0)
-    env = make_street(replace(empty_road, camera=behind))
-    observation, _ = env.reset(seed=0)
-    assert set(np.unique(observation["semantic"][0, 50:, 36:48])) == {1}
-
-
-@pytest.mark.parametrize("rate_hz", [12.0, 6.0])
-def test_the_ending_zone_is_reached_after_150_m(make_street, empty_road, rate_hz):
-    rewards, info = drive(make_street(empty_road, frame_rate_hz=rate_hz, sensors=()))
-    assert info["outcome"] == "success"
-    # 150 m at 10 m/s are 15 s; one step more where rounding leaves it on the edge.
-    assert len(rewards) in (round(15 * rate_hz), round(15 * rate_hz) + 1)
-    assert sum(rewards) == pytest.approx(5.0 + 0.01 * len(rewards))
-
-
-@pytest.mark.parametrize("action", [LEFT, RIGHT])
-def test_turning_all_the_time_leads_off_the_road(make_street, empty_road, action):
-    rewards, info = drive(make_street(empty_road, sensors=()), action)
-    assert (info["outcome"], info["hit"]) == ("out_of_bounds", "")
-    # Yaw grows as 35°/s² t²/2; y as its integral, 10·0.61·t³/6 = 1.02 t³: 3 m in about 1.4 s.
-    assert 14 <= len(rewards) <= 18
-    assert sum(rewards) == pytest.approx(-5.0 + 0.01 * len(rewards))
-
-
-@pytest.mark.parametrize(("rate_hz", "steps"), [(12, 200), (6, 100), (7, 117), (15, 250)])
-def test_the_time_limit_keeps_its_seconds(make_street, empty_road, rate_hz, steps):
-    # 200 steps at 12 Hz are 16.67 s; at 7 Hz these are 116.7 steps, so that the 117th is too late.
-    # 200 / 12 · 15 is 250.00000000000003 in floating point.
+@pytest.mark.parametrize(
+    ("outcome", "rate_hz", "speed_mps", "action", "steps"),
+    [
+        # 150 m at 10 m/s are 15 s; one step more where rounding leaves it on the edge.
+        ("success", 12, 10.0, NO_OP, (180, 181)), ("success", 6, 10.0, NO_OP, (90, 91)),
+        # Yaw grows as 35°/s² t²/2; y as its integral, 10·0.61·t³/6 = 1.02 t³: 3 m in about 1.4 s.
+        ("out_of_bounds", 12, 10.0, LEFT, (14, 18)), ("out_of_bounds", 12, 10.0, RIGHT, (14, 18)),
+        # 200 steps at 12 Hz are 16.67 s; at 7 Hz these are 116.7 steps: the 117th is too late.
+        # 200 / 12 · 15 is 250.00000000000003 in floating point.
+        ("timeout", 12, 0.0, NO_OP, (200, 200)), ("timeout", 6, 0.0, NO_OP, (100, 100)),
+        ("timeout", 7, 0.0, NO_OP, (117, 117)), ("timeout", 15, 0.0, NO_OP, (250, 250)),
+    ],
+)  # fmt: skip
+def test_an_episode_ends_after_its_seconds_at_any_frame_rate(
+    make_street, empty_road, outcome, rate_hz, speed_mps, action, steps
+):
     env = make_street(empty_road, frame_rate_hz=rate_hz, sensors=())
-    rewards, info = drive(env, vehicle_speed_mps=0.0)
-    assert info["outcome"] == "timeout"
-    assert len(rewards) == steps
-    assert sum(rewards) == pytest.approx(-5.0 + 0.01 * steps)
+    rewards, info = drive(env, action, vehicle_speed_mps=speed_mps)
+    assert (info["outcome"], info["hit"]) == (outcome, "")
+    assert steps[0] <= len(rewards) <= steps[1]
+    last = 5.0 if outcome == "success" else -5.0
+    assert sum(rewards) == pytest.approx(last + 0.01 * len(rewards))
 
 
 @pytest.mark.parametrize(
@@ -141,9 +125,8 @@ def test_no_frame_rate_lets_the_vehicle_pass_through_a_person(
 
 def test_each_person_is_hit_by_their_own_size(make_street, one_stands):
     (person,) = one_stands.pedestrian_groups
-    behind = replace(
-        person, name="behind", walk=replace(person.walk, points_m=((60.0, 0), (60.0, 1)))
-    )
+    there = replace(person.walk, points_m=((60.0, 0), (60.0, 1)))
+    behind = replace(person, name="behind", walk=there)
     scene = replace(one_stands, pedestrian_groups=(behind, person), pedestrian_size=(0.2, 3.0))
     env = make_street(scene, sensors=())
     drive(env)
@@ -199,55 +182,40 @@ def test_an_action_is_a_whole_number_of_any_kind(make_street, empty_road):
         assert env.episode.now.vehicle.yaw_rate_rps == pytest.approx(expected)
 
 
-def test_the_speed_mode_changes_nothing_but_peoples_speed(make_street, straight_road):
-    def travelled(speed):
+def test_the_speed_mode_changes_peoples_speed_alone_which_a_group_has_together(
+    make_street, straight_road
+):
+    seeds = set()
+    for speed, (low, high) in straight_road.pedestrian_speed_mps.items():
         env = make_street(speed=speed, sensors=())
         env.reset(seed=3)
-        crowd = env.episode.crowd
-        steps = np.hypot(*(crowd.positions(0.01) - crowd.positions(0.0)).T) / 0.01
-        return env.episode.seed, steps
-
-    for speed, (low, high) in straight_road.pedestrian_speed_mps.items():
-        seed, steps = travelled(speed)
-        assert seed == travelled("normal")[0]
-        assert (steps > low - 1e-6).all()
-        assert (steps < high + 1e-6).all()
-
-
-def test_a_group_walks_at_one_speed_in_one_direction(make_street):
-    env = make_street(sensors=())
-    env.reset(seed=3)
-    crowd = env.episode.crowd
-    # Members may turn about at different times.
-    members = env.scene.pedestrian_groups[0].count
-    pace = np.abs(crowd.positions(0.01) - crowd.positions(0.0))[:, 1].reshape(-1, members)
-    np.testing.assert_allclose(pace, np.repeat(pace[:, :1], members, axis=1), rtol=1e-3)
-    assert len(np.unique(pace[:, 0].round(6))) == len(pace)
-
-
-def test_rendering_does_not_change_the_episode(make_street):
-    seeing, blind = make_street(), make_street(sensors=())
-    for env in (seeing, blind):
-        env.reset(seed=5)
-    for _ in range(15):
-        assert seeing.step(NO_OP)[1:] == blind.step(NO_OP)[1:]
-        assert seeing.get_state() == blind.get_state()
+        seeds.add(env.episode.seed)
+        first, then = map(env.episode.crowd.positions, (0.0, 0.01))
+        steps_mps = np.hypot(*(then - first).T) / 0.01
+        assert (steps_mps > low - 1e-6).all()
+        assert (steps_mps < high + 1e-6).all()
+        # Across the road; members may turn about at different times.
+        members = straight_road.pedestrian_groups[0].count
+        pace = np.abs(then - first)[:, 1].reshape(-1, members)
+        np.testing.assert_allclose(pace, np.repeat(pace[:, :1], members, axis=1), rtol=1e-3)
+        assert len(np.unique(pace[:, 0].round(6))) == len(pace)
+    assert len(seeds) == 1
 
 
 def test_reset_options_set_speed_and_frame_rate_of_one_episode(make_street):
-    """On one street all is as on a street made for them, and its own come back afterwards."""
-    shared, made_for = make_street(), make_street(speed="high", frame_rate_hz=7.0)
-    for env, options in ((shared, {"speed": "high", "frame_rate_hz": 7.0}), (made_for, {})):
-        env.reset(options={"episode_seed": 11} | options)
+    """All is as on a street made for them, which sees nothing; its own come back afterwards."""
+    given = {"speed": "high", "frame_rate_hz": 7.0}
+    shared, made_for = make_street(), make_street(**given, sensors=())
+    for env, options in ((shared, given), (made_for, {})):
+        env.reset(seed=5, options={"episode_seed": 11} | options)
         for _ in range(3):
             env.step(LEFT)
-    state = json.loads(json.dumps(shared.get_state()))
-    assert shared.episode.now == made_for.episode.now
+    assert shared.get_state() == made_for.get_state()
     assert np.array_equal(shared.episode.poses, made_for.episode.poses)
-    assert same(shared.step(RIGHT)[0], made_for.step(RIGHT)[0])
     resumed = make_street()
-    resumed.reset(options={"state": state})
-    assert same(resumed.step(RIGHT)[0], shared.sensing.observe(shared.episode))
+    again, _ = resumed.reset(options={"state": json.loads(json.dumps(shared.get_state()))})
+    assert differing(again, shared.sensing.observe(shared.episode)) == []
+    assert differing(shared.step(RIGHT), resumed.step(RIGHT)) == []
     shared.reset(options={"episode_seed": 11})
     assert shared.episode.speed_mps == shared.scene.pedestrian_speed_mps["normal"]
     assert shared.episode.frame_rate_hz == 12.0
@@ -285,13 +253,21 @@ def test_numba_is_imported_only_to_draw(monkeypatch):
         StreetEnv(picture_scale=7)  # no open env has this camera, which would be shared
 
 
-def test_a_step_without_a_running_episode_says_to_call_reset(make_street, one_stands):
-    env = make_street(one_stands, sensors=())
+def test_without_a_running_episode_the_street_says_to_call_reset_which_opens_it_again(
+    make_street, one_stands
+):
+    env = make_street(one_stands, sensors=("depth",), render_mode="rgb_array")
     with pytest.raises(RuntimeError, match="call reset"):
         env.step(NO_OP)
     drive(env)
     with pytest.raises(RuntimeError, match=r"has ended \(collision\): call reset"):
         env.step(NO_OP)
+    before, _ = env.reset(seed=1)
+    env.close()
+    with pytest.raises(RuntimeError, match="call reset"):
+        env.render()
+    assert differing(before, env.reset(seed=1)[0]) == []
+    assert env.render().shape == (84, 84, 3)
 
 
 def test_invalid_reset_options_are_refused(make_street, empty_road):
@@ -324,16 +300,6 @@ def test_invalid_reset_options_are_refused(make_street, empty_road):
         env.reset(options={"state": state, "path": "main"})
     last = (1 << 62) - 1
     assert env.reset(options={"episode_seed": np.int64(last)})[1]["episode_seed"] == last
-
-
-def test_a_closed_street_opens_again_with_a_reset(make_street, empty_road):
-    env = make_street(empty_road, sensors=("depth",), render_mode="rgb_array")
-    before, _ = env.reset(seed=1)
-    env.close()
-    with pytest.raises(RuntimeError, match="call reset"):
-        env.render()
-    assert same(before, env.reset(seed=1)[0])
-    assert env.render().shape == (84, 84, 3)
 
 
 def test_motion_between_two_steps_is_the_one_driven(make_street, empty_road):

@@ -3,7 +3,6 @@
 import multiprocessing
 import shutil
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,20 +13,8 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from flowrep import envs
-from flowrep.config import CONF_DIR
-from flowrep.config.yaml_file import read_yaml
-from flowrep.envs import (
-    Outcome,
-    begin_step,
-    get_states,
-    has_spare_cores,
-    make_env,
-    make_mirror,
-    set_states,
-    street_envs,
-)
+from flowrep.envs import make_env, street_envs
 from flowrep.envs.sensing import SENSORS
-from flowrep.scenes import SceneError, load_scene
 from flowrep.scenes.scene import CATEGORY_ID
 from flowrep.transforms import Depth, FlowFactorize, RawFlow
 from tests.comparing import differing
@@ -41,39 +28,26 @@ def make(close_later):
     return lambda *args, **kwargs: close_later(make_env(*args, **kwargs))
 
 
-@pytest.fixture(scope="module")
-def in_workers():
-    """Two environments in a process each: starting those takes a second."""
-    env = make_env(num_envs=2, num_workers=2)
-    yield env
-    env.close()
+def test_flow_of_a_time_is_a_share_of_a_step_s_by_the_frame_rate(make):
+    flows = []
+    for rate_hz in (None, 12):
+        env = make(representations={"raw": {"rate_hz": rate_hz}}, seed=3, frame_rate_hz=6.0)
+        flows.append(env.step(env.reset().set("action", torch.zeros(1).long()))["next", "raw"])
+    step, time = flows
+    assert step.abs().max() > 1
+    torch.testing.assert_close(time, step / 2)  # 1/12 s is half of 1/6 s
 
 
-def test_flow_of_a_time_is_nearly_the_same_at_any_frame_rate(make):
-    # People walk straight on for 1/6 s, so that flow of 1/12 s is half of a step's at 6 Hz, up to
-    # perspective. At 12 Hz the second frame is the first one at 6 Hz.
-    options = {"representations": {"raw": {"rate_hz": 12}}, "seed": 3}
-    slow, fast = make(**options, frame_rate_hz=6.0), make(**options)
-    at_slow = slow.step(slow.reset().set("action", torch.zeros(1).long()))["next", "raw"]
-    td = fast.reset()
-    for _ in range(2):
-        td = fast.step(td.set("action", torch.zeros(1).long()))["next"]
-    apart, length = (at_slow - td["raw"]).norm(dim=1), td["raw"].norm(dim=1)
-    moving = length > 0.5
-    assert moving.sum() > 100
-    assert (apart / length)[moving].median() < 0.15
+def actions_of(*size):
+    return torch.randint(3, size, generator=torch.Generator().manual_seed(0))
 
 
-def actions_of(count, num_envs, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    return torch.randint(3, (count, num_envs), generator=generator)
-
-
-def play(env, actions, start=None):
+def play(env, actions, start=None, begin=lambda env, acted: None):
     """Returns the steps of given actions, ended episodes begun anew."""
     tensordict, steps = env.reset() if start is None else start, []
     for action in actions:
-        stepped, tensordict = env.step_and_maybe_reset(tensordict.set("action", action))
+        begin(env, tensordict.set("action", action))
+        stepped, tensordict = env.step_and_maybe_reset(tensordict)
         steps.append(stepped.clone())
     return torch.stack(steps), tensordict
 
@@ -122,19 +96,11 @@ def test_a_transform_of_dropped_sensors_says_how_to_keep_them(make):
     assert "keep_sensor" not in str(caught.value)
 
 
-def test_a_scene_is_given_by_file_as_a_mapping_or_parsed(make):
-    file = CONF_DIR / "scene" / "straight_road.yaml"
-    scene = load_scene(file)
-    assert make(file).base_env.scene == make(read_yaml(file)).base_env.scene == scene
-    # One that no file has: the camera's size is what the maps have.
-    small = replace(scene, camera=replace(scene.camera, height_px=20, width_px=30))
-    env = make(small, ["seg", "ego"])
+def test_maps_have_the_size_of_the_camera_of_a_scene_that_no_file_has(make, straight_road):
+    camera = replace(straight_road.camera, height_px=20, width_px=30)
+    env = make(replace(straight_road, camera=camera), ["seg", "ego"])
     assert env.reset()["seg"].shape == (1, 1, 20, 30)
-    assert env.base_env.scene == small
-    with pytest.raises(SceneError, match="straight_roed"):
-        make("straight_roed")
-    with pytest.raises(SceneError, match=r"roads"):
-        make(replace(scene, roads=()))
+    assert env.base_env.scene.camera == camera
 
 
 @pytest.mark.slow_after_first
@@ -196,35 +162,27 @@ def test_rendered_pictures_and_flow_estimator_have_the_same_scale(make):
         assert street.observation_space["rgb"].shape == (3, 168, 168)
 
 
-def test_an_env_that_ends_is_reset_alone(make):
-    env = make(representations=["seg"], num_envs=3, seed=1)
-    # The first turns off the road within 20 steps; the others go straight on.
-    steps, _ = play(env, torch.tensor([[1, 0, 0]]).expand(30, 3))
-    first = int(steps["next", "done"][:, 0, 0].nonzero()[0])
-    assert first < 20
-    last, then = steps["next"][first], steps[first + 1]
-    assert last["outcome"][0] == Outcome.OUT_OF_BOUNDS
-    assert not steps["next", "truncated"].any()
-    assert (then["episode_seed"] != last["episode_seed"])[:, 0].tolist() == [True, False, False]
-    # The new episode's first picture is its own; what the others see goes on.
-    alone = make(representations=["seg"], num_envs=1)
-    begun = alone.reset(options={"episode_seed": int(then["episode_seed"][0])})
-    assert torch.equal(begun["seg"][0], then["seg"][0])
-    assert torch.equal(then["seg"][1:], last["seg"][1:])
-
-
 @pytest.mark.slow
-def test_envs_in_workers_equal_envs_in_one_process(make):
-    actions = actions_of(24, 3)
+def test_envs_in_workers_equal_envs_in_one_process_and_take_their_states(make):
+    actions = actions_of(34, 3)
     actions[:, 0] = 1  # which leads off the road within 20 steps
-    arguments = {"representations": ["ego", "obj"], "num_envs": 3, "keep_sensor": True}
-    alone, _ = play(make(**arguments, seed=7), actions)
-    env = make(**arguments, seed=7, num_workers=2)
-    check_env_specs(env)
-    env.set_seed(np.int64(7))  # numpy's numbers are numbers, too
-    shared, _ = play(env, actions)
-    assert alone["next", "done"].any()
-    assert differing(alone, shared) == []
+    arguments = {"representations": ["ego", "obj", "seg"], "num_envs": 3, "noise": NOISE}
+    alone, shared = make(**arguments), make(**arguments, num_workers=2)
+    check_env_specs(shared)
+    for env in (alone, shared):
+        env.set_seed(np.int64(7))  # numpy's numbers are numbers, too
+    (steps, then), (in_workers, _) = (play(env, actions[:24]) for env in (alone, shared))
+    assert steps["next", "done"].any()
+    assert differing(steps, in_workers) == []
+    states, then = envs.get_states(alone), then.clone()
+    with pytest.raises(ValueError, match="1 states for 3 envs"):
+        envs.set_states(alone, states[:1])
+    expected, _ = play(alone, actions[24:], then.clone(), envs.begin_step)  # does nothing here
+    shared.reset()
+    envs.set_states(shared, states)
+    assert envs.get_states(shared) == states
+    resumed, _ = play(shared, actions[24:], then, envs.begin_step)
+    assert differing(expected, resumed) == []
 
 
 @pytest.mark.slow
@@ -247,7 +205,7 @@ def test_public_names_are_imported_on_first_use():
 
 
 def test_the_mirror_of_a_scene_knows_its_flows_actions_and_camera():
-    mirror = make_mirror("straight_road", ["ego", "seg2"])
+    mirror = envs.make_mirror("straight_road", ["ego", "seg2"])
     mirror.images = "all"
     maps = {"ego": torch.randn(2, 84, 84), "seg2": torch.randint(5, (2, 84, 84))}
     image = mirror(TensorDict(maps | {"action": torch.tensor(1)}))
@@ -256,16 +214,7 @@ def test_the_mirror_of_a_scene_knows_its_flows_actions_and_camera():
     assert torch.equal(image["ego"][..., 1:], turned[..., :-1])
     assert torch.equal(image["seg2"][..., 1:], maps["seg2"].flip(-1)[..., :-1])
     assert image["action"] == 2
-    assert make_mirror("straight_road", "ego").flow_keys == ["ego"]
-
-
-def test_begin_step_does_not_change_the_step(make, in_workers):
-    late, early = make(num_envs=2), in_workers
-    for env in (late, early):
-        env.set_seed(np.int64(3))
-        begin_step(env, env.reset().set("action", torch.tensor([1, 2])))
-    begun = early.step(early.reset().set("action", torch.tensor([1, 2])))
-    assert differing(late.step(late.reset().set("action", torch.tensor([1, 2]))), begun) == []
+    assert envs.make_mirror("straight_road", "ego").flow_keys == ["ego"]
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -282,30 +231,14 @@ def test_an_env_on_cuda_equals_the_env_on_the_cpu(make, num_workers):
         torch.testing.assert_close(there[key].cpu(), here[key], rtol=1e-4, atol=1e-4)
 
 
-def test_workers_occupy_cores_and_hide_their_streets(make, in_workers, monkeypatch):
+def test_workers_occupy_cores_and_hide_their_streets(make, monkeypatch):
+    in_workers = make(num_envs=2, num_workers=2)
     monkeypatch.setattr("flowrep.envs.torchrl_env.available_cores", lambda: 4)
-    assert has_spare_cores(in_workers, 2)
-    assert not has_spare_cores(in_workers, 3)
-    assert has_spare_cores(make(num_envs=2), 4)
+    assert envs.has_spare_cores(in_workers, 2)
+    assert not envs.has_spare_cores(in_workers, 3)
+    assert envs.has_spare_cores(make(num_envs=2), 4)
     with pytest.raises(ValueError, match="num_workers=0"):
         street_envs(in_workers)
-
-
-def test_states_pass_between_workers_and_one_process(make):
-    actions = actions_of(30, 3, seed=3)
-    make = partial(make, representations=["ego"], num_envs=3, noise=NOISE)
-    alone = make(seed=0)
-    _, then = play(alone, actions[:20])
-    states, then = get_states(alone), then.clone()
-    with pytest.raises(ValueError, match="1 states for 3 envs"):
-        set_states(alone, states[:1])
-    expected, _ = play(alone, actions[20:], then.clone())
-    shared = make(seed=99, num_workers=2)
-    shared.reset()
-    set_states(shared, states)
-    assert get_states(shared) == states
-    resumed, _ = play(shared, actions[20:], then)
-    assert differing(expected, resumed) == []
 
 
 def test_the_order_of_episodes_does_not_depend_on_the_policy(make):
@@ -324,7 +257,7 @@ def test_hit_is_the_class_of_what_the_vehicle_hit(make):
     env = make(representations=(), num_envs=3, seed=1)
     steps, _ = play(env, torch.zeros(200, 3, dtype=torch.long))
     outcome, hit = steps["next", "outcome"], steps["next", "hit"]
-    collided = outcome == Outcome.COLLISION
+    collided = outcome == envs.Outcome.COLLISION
     assert collided.any()
     # Straight on, only people are in the way.
     assert set(hit[collided].tolist()) == {CATEGORY_ID["pedestrian"]}

@@ -1,12 +1,11 @@
 """What can't be a scene is refused on one line that names the key."""
 
-import copy
-from dataclasses import replace
+from functools import reduce
+from operator import getitem
 
 import pytest
 
 from flowrep.scenes import SceneError, load_scene
-from flowrep.scenes.scene import PedestrianGroup, Walk
 
 MISSING = object()
 ALL = ["sky", "road", "sidewalk", "building", "pedestrian", "car", "crosswalk"]
@@ -16,18 +15,20 @@ BUILDING_ROW |= {"front_m": [7, 9], "depth_m": [6, 9], "height_m": [5, 9]}
 OBSTACLE_ROW = {"road": "stem", "kind": "house", "offset_m": 8.0, "from_m": 0.0, "to_m": 40.0}
 OBSTACLE_ROW |= {"every_m": 9.0, "size_m": [1.0, 1.0, 1.0]}
 POINTS = {"kind": "points", "road": "stem", "points_m": [[25.0, -5.0], [25.0, 5.0]]}
+ACROSS = {"kind": "across", "road": "stem", "at_m": 25.0}
 ON_STEM = {"name": "west", "road": "stem", "from_m": 2.0, "to_m": 9.0}
 CAR_BESIDE = {"kind": "car", "center_m": [22.8, 2.0], "yaw_deg": 0.0, "size_m": [4.0, 1.8, 1.5]}
 
 
+def through(*points_m):
+    return {"kind": "points", "points_m": [[float(x), float(y)] for x, y in points_m]}
+
+
 def refusal(data, changes):
     """Returns the message that refuses the data with a value at each dotted key."""
-    data = copy.deepcopy(data)
     for key, value in changes.items():
         *parents, last = [int(part) if part.isdigit() else part for part in key.split(".")]
-        at = data
-        for parent in parents:
-            at = at[parent]
+        at = reduce(getitem, parents, data)
         if value is MISSING:
             del at[last]
         else:
@@ -138,35 +139,19 @@ def test_an_ending_zone_may_be_a_metre_long(data):
     assert load_scene(data).zones[1].to_m == 64.1
 
 
-def across(name, count, spread_m, at_m):
-    return PedestrianGroup(name, count, spread_m, Walk("across", road="main", at_m=at_m))
-
-
-def through(name, count, spread_m, *points):
-    return PedestrianGroup(name, count, spread_m, Walk("points", points_m=points))
-
-
 @pytest.mark.parametrize(
-    ("groups", "expected"),
+    ("group", "changes", "says"),
     [
         # Lanes are 0.61 m apart.
-        ([across("three", 3, 1.0, 50.0)], "three.spread_m: is 1.0, but 3 people need lanes 1.22 m"),
-        (
-            [across("one", 2, 1.0, 50.0), across("two", 2, 1.0, 51.5)],
-            "one: people of 'two' come within 0.50 m",
-        ),
-        (
-            [across("one", 1, 0.0, 50.0), through("along", 1, 0.0, (15.0, 0.0), (35.0, 0.0))],
-            "one: people of 'along' come within 0.00 m",
-        ),
-        ([through("one", 1, 0.0, (9.0, 0.0), (9.0, 0.0))], "one.walk: has no length"),
-        (
-            [through("back", 2, 1.0, (9.0, 0.0), (20.0, 0.0), (20.0, 1.0), (9.0, 1.0))],
-            "back.walk: comes too near to itself",
-        ),
+        ("across", {"count": 3}, ".spread_m: is 1.0, but 3 people need lanes 1.22 m"),
+        # They reach to 0.5 m beside 25 m, and to 0.7 m beside 26.5 m.
+        ("along", {"walk": ACROSS | {"at_m": 26.5}}, ": people of 'across' come within 0.30 m"),
+        ("along", {"walk": through((15, 0), (35, 0))}, ": people of 'across' come within 0.00 m"),
+        ("across", {"walk": through((9, 0), (9, 0))}, ".walk: has no length"),
+        ("across", {"walk": through((9, 0), (20, 0), (20, 1.4), (9, 1.4))}, ".walk: comes"),
+        ("across", {"count": 1, "walk": through((9, 0), (20, 0), (20, 0.4))}, ".walk: comes"),
     ],
 )
-def test_walks_on_which_people_could_overlap_are_refused(straight_road, groups, expected):
-    with pytest.raises(SceneError) as caught:
-        load_scene(replace(straight_road, pedestrian_groups=tuple(groups)))
-    assert f"pedestrian_groups.{expected}" in str(caught.value)
+def test_walks_on_which_people_could_overlap_are_refused(data, group, changes, says):
+    next(each for each in data["pedestrian_groups"] if each["name"] == group).update(changes)
+    assert refusal(data, {}).startswith(f"pedestrian_groups.{group}{says}")

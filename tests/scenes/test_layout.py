@@ -23,10 +23,7 @@ def test_an_arc_ends_where_its_radius_says(data):
     assert heading == pytest.approx(math.pi / 2)
     assert x == pytest.approx(53.0)  # left of +y is -x
     assert y > 40
-
-
-def test_roads_that_meet_are_one_ground_and_sidewalks_leave_it_free(data):
-    layout = Layout(load_scene(data))
+    # Roads that meet are one ground, which sidewalks leave free.
     assert layout.drivable.geom_type == "Polygon"
     assert layout.sidewalks.intersection(layout.drivable).area == pytest.approx(0.0, abs=1e-6)
 
@@ -63,6 +60,9 @@ def test_corners_are_rounded_where_roads_meet(data):
     assert rounded.area - square.area == pytest.approx(2 * (1 - math.pi / 4) * 16, rel=0.02)
     assert rounded.contains(shapely.Point(31.0, 4.0))
     assert not rounded.contains(shapely.Point(28.0, 7.0))
+    # Without sidewalks there are none at the corners either.
+    data |= {"roads": [road | {"sidewalk_m": 0.0} for road in roads], "corner_radius_m": 4.0}
+    assert Layout(load_scene(data)).sidewalks.is_empty
 
 
 def test_rows_leave_out_obstacles_on_other_roads(data):
@@ -129,17 +129,9 @@ def test_rows_beyond_a_road_are_on_its_straight_continuation(straight_road):
     # Wall to wall, each 10 m wide: from -55 to -25, and from 187 to 207.
     middles = [-50, -40, -30, 192, 202]
     np.testing.assert_allclose([house.x_m for house in layout.buildings], middles)
-
-
-def test_a_row_that_ends_with_its_road_has_no_house_beyond_it(straight_road):
+    # A row that ends with its road has no house beyond it.
     *rows, across = Layout(straight_road).buildings
     assert max(house.x_m for house in rows) < 190 < across.x_m
-
-
-def test_rounded_roads_without_sidewalks_have_none(data):
-    data |= {"roads": [road | {"sidewalk_m": 0.0} for road in data["roads"]]}
-    data |= {"pedestrian_groups": [], "corner_radius_m": 5.0}
-    assert Layout(load_scene(data)).sidewalks.is_empty
 
 
 def test_a_line_moved_aside_is_parallel_stretch_by_stretch():

@@ -7,17 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrep.scenes import load_scene, scene_names
+from flowrep.scenes import load_scene, pedestrians, scene_names
 from flowrep.scenes.layout import Layout
-from flowrep.scenes.pedestrians import (
-    PARTS,
-    Crowd,
-    draw_crowd,
-    draw_lanes,
-    keeps_its_stretches,
-    keeps_lanes_apart,
-    world_from_parts,
-)
 from flowrep.scenes.scene import PedestrianGroup, SceneError, Walk
 from flowrep.simulator.meshes import person_meshes
 
@@ -32,7 +23,7 @@ LINES = [
 @pytest.fixture
 def crowd():
     # C's phase is a quarter of the way there and back: half-way there.
-    return Crowd(LINES, np.array([1.0, 2.0, 0.0]), np.array([0.0, 0.0, 0.25]))
+    return pedestrians.Crowd(LINES, np.array([1.0, 2.0, 0.0]), np.array([0.0, 0.0, 0.25]))
 
 
 @pytest.mark.parametrize(
@@ -92,7 +83,7 @@ HIP_M, LEG_M = 0.82, 0.82
 
 
 def test_a_leg_swings_back_while_the_other_swings_forward_and_the_body_only_turns():
-    body, left, right = world_from_parts(POSE, np.ones(1))
+    body, left, right = pedestrians.world_from_parts(POSE, np.ones(1))
     np.testing.assert_allclose(body @ [1.0, 0.0, 1.2, 1.0], [5.0, 3.0, 1.2, 1.0], atol=1e-12)
     foot = np.array([0.0, 0.0, -LEG_M, 1.0])
     # sin 30° = 0.5: the foot is 0.41 m behind or before the hip and at 0.82·(1 - cos 30°) m.
@@ -104,15 +95,12 @@ def test_a_leg_swings_back_while_the_other_swings_forward_and_the_body_only_turn
 @pytest.mark.parametrize(("swing", "size"), [(0.0, 1.0), (0.38, 1.0), (-0.38, 0.7)])
 def test_people_stand_on_the_ground_and_fill_no_more_than_the_cylinder(swing, size):
     poses = np.array([[0.0, 0.0, 0.0, swing]])
+    places = pedestrians.world_from_parts(poses, np.array([size]))
+    parts = zip(person_meshes(0, size), places, strict=True)
     points = np.concatenate(
-        [
-            mesh.triangles[0].reshape(-1, 3) @ transform[:3, :3].T + transform[:3, 3]
-            for mesh, transform in zip(
-                person_meshes(0, size), world_from_parts(poses, np.array([size])), strict=True
-            )
-        ]
+        [mesh.triangles[0].reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3] for mesh, pose in parts]
     )
-    assert len(PARTS) == 3
+    assert len(pedestrians.PARTS) == 3
     assert -0.05 < points[:, 2].min() < 0.1
     assert points[:, 2].max() == pytest.approx(1.75 * size)
     assert np.abs(points[:, 1]).max() < 0.35 * size
@@ -122,26 +110,23 @@ CROSSROADS = Path(__file__).parent / "crossroads.yaml"
 CORNER = np.array([(0.0, 0.0), (4.0, 0.0), (4.0, 3.0)])
 
 
-def test_a_stretch_is_lost_where_a_line_is_moved_further_inwards_than_it_is_long():
+def test_lanes_are_refused_where_a_stretch_is_lost_or_a_walk_comes_back_beside_itself():
     # A right angle takes a metre of either stretch for each metre to the left; the second has 3.
-    assert keeps_its_stretches(CORNER, 2.9)
-    assert not keeps_its_stretches(CORNER, 3.1)
-    assert keeps_its_stretches(CORNER, -9.0)
-
-
-def test_lanes_are_refused_where_a_walk_comes_back_beside_itself():
+    assert pedestrians.keeps_its_stretches(CORNER, 2.9)
+    assert not pedestrians.keeps_its_stretches(CORNER, 3.1)
+    assert pedestrians.keeps_its_stretches(CORNER, -9.0)
     hairpin = np.array([(0.0, 0.0), (10.0, 0.0), (10.0, 2.0), (0.0, 2.0)])
     # The two ways are 2 m apart: room for 0.3 m beside the outermost of lanes 1.3 m wide together.
-    assert keeps_lanes_apart(hairpin, 1.3, 1.0)
-    assert not keeps_lanes_apart(hairpin, 1.5, 1.0)
-    assert keeps_lanes_apart(hairpin, 1.5, 0.7)
+    assert pedestrians.keeps_lanes_apart(hairpin, 1.3, 1.0)
+    assert not pedestrians.keeps_lanes_apart(hairpin, 1.5, 1.0)
+    assert pedestrians.keeps_lanes_apart(hairpin, 1.5, 0.7)
     crossing = np.array([(0.0, 0.0), (10.0, 0.0), (10.0, 6.0), (5.0, 6.0), (5.0, -6.0)])
-    assert not keeps_lanes_apart(crossing, 0.7, 1.0)
+    assert not pedestrians.keeps_lanes_apart(crossing, 0.7, 1.0)
 
 
 def test_lanes_are_drawn_evenly_from_all_that_are_wide_enough():
     rng = np.random.default_rng(0)
-    draws = np.array([draw_lanes(2, 1.61, 1.0, rng) for _ in range(4000)])
+    draws = np.array([pedestrians.draw_lanes(2, 1.61, 1.0, rng) for _ in range(4000)])
     gaps = np.abs(draws[:, 0] - draws[:, 1])
     assert gaps.min() >= 0.61 - 1e-12
     assert np.abs(draws).max() <= 1.61 / 2
@@ -150,7 +135,7 @@ def test_lanes_are_drawn_evenly_from_all_that_are_wide_enough():
     assert (draws[:, 0] > draws[:, 1]).mean() == pytest.approx(0.5, abs=0.03)
     assert draws.mean(axis=0) == pytest.approx(0.0, abs=0.03)
     np.testing.assert_allclose(
-        np.sort(draw_lanes(3, 1.22, 1.0, rng)), [-0.61, 0.0, 0.61], atol=1e-9
+        np.sort(pedestrians.draw_lanes(3, 1.22, 1.0, rng)), [-0.61, 0.0, 0.61], atol=1e-9
     )
 
 
@@ -160,7 +145,7 @@ def least_distance(scene, speed_mps, episodes):
     times = np.arange(0.0, scene.time_limit_s, 1 / 24)[:, None]
     for episode in range(episodes):
         rng = np.random.default_rng(episode)
-        places = draw_crowd(layout, speed_mps, rng).positions(times)
+        places = pedestrians.draw_crowd(layout, speed_mps, rng).positions(times)
         one, other = np.triu_indices(places.shape[1], 1)
         gaps = places[:, one] - places[:, other]
         least = min(least, np.hypot(gaps[..., 0], gaps[..., 1]).min())
@@ -173,13 +158,6 @@ def test_people_never_overlap(name, speed_mps):
     assert least_distance(load_scene(name), speed_mps, episodes=15) >= 0.6
 
 
-def test_people_of_another_size_keep_apart_by_it():
-    large = replace(load_scene("s_turn"), pedestrian_size=1.5)
-    assert least_distance(load_scene(large), (1.2, 1.8), episodes=15) >= 0.9
-    with pytest.raises(SceneError, match="spread_m"):
-        load_scene(replace(large, pedestrian_size=3.0))
-
-
 def test_people_of_various_sizes_keep_apart_as_the_largest():
     mixed = load_scene(replace(load_scene("s_turn"), pedestrian_size=(0.5, 1.5)))
     sizes = mixed.pedestrian_sizes
@@ -188,6 +166,8 @@ def test_people_of_various_sizes_keep_apart_as_the_largest():
     # The first two are 0.618 and 0.236 of the way.
     np.testing.assert_allclose(sizes[:2], [1.118, 0.736], atol=1e-3)
     assert least_distance(mixed, (1.2, 1.8), episodes=15) >= 0.9
+    with pytest.raises(SceneError, match="spread_m: is"):
+        load_scene(replace(mixed, pedestrian_size=3.0))
 
 
 @pytest.mark.parametrize("draw", ["group", "pedestrian"])

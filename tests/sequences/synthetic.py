@@ -3,8 +3,6 @@
 And four frames of 7-Scenes that lie beside the checkout; tests that use them skip without.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from dataclasses import dataclass
@@ -26,6 +24,9 @@ needs_7scenes = pytest.mark.skipif(
 
 HEIGHT, WIDTH, FRAMES = 24, 40, 3
 K = np.array([[31.0, 0.0, 18.5], [0.0, 27.0, 13.0], [0.0, 0.0, 1.0]])
+# The same, with pixel (0, 0)'s centre at (0, 0).
+OPENCV_K = K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+OPENCV_INTRINSICS = (31.0, 27.0, 18.0, 12.5)
 
 
 @dataclass(frozen=True)
@@ -80,10 +81,10 @@ def put(path: Path, content) -> None:
         path.write_bytes(content)
     elif path.suffix == ".npy":
         np.save(path, content)
-    elif path.suffix == ".png":
-        assert cv2.imwrite(str(path), content[..., ::-1] if content.ndim == 3 else content)
     elif path.suffix == ".flo":
         assert cv2.writeOpticalFlow(str(path), np.ascontiguousarray(content.transpose(1, 2, 0)))
+    elif isinstance(content, np.ndarray):
+        assert cv2.imwrite(str(path), content[..., ::-1] if content.ndim == 3 else content)
     else:
         path.write_text("".join(f"{line}\n" for line in content))
 
@@ -92,11 +93,23 @@ def stored(depth: np.ndarray, unit_m: float) -> np.ndarray:
     return np.rint(depth / unit_m).astype(np.uint16)
 
 
-def put_pictures(folder: Path, moments, rgb: str, depth: str, unit_m: float, names=None) -> None:
-    """Writes pictures and depth; names stand for the braces of their files' names."""
-    for name, moment in zip(names or range(len(moments)), moments):
-        put(folder / f"{rgb.format(name)}.png", moment.rgb)
-        put(folder / f"{depth.format(name)}.png", stored(moment.depth, unit_m))
+def pictures(rgb: str, depth: str, unit_m: float, names=range(FRAMES)):
+    """Decorates what writes the rest of a format: before it, pictures and depth are written.
+
+    Names stand for the braces of their files' names.
+    """
+
+    def decorate(write_rest):
+        def write(folder: Path) -> list[Moment]:
+            moments = make_moments(unit_m=unit_m)
+            for name, moment in zip(names, moments):
+                put(folder / f"{rgb.format(name)}.png", moment.rgb)
+                put(folder / f"{depth.format(name)}.png", stored(moment.depth, unit_m))
+            return write_rest(folder, moments) or moments
+
+        return write
+
+    return decorate
 
 
 def numbers(values) -> str:
@@ -116,20 +129,16 @@ def camera_json(**changes) -> list[str]:
     return [json.dumps(size | {"fx": 31.0, "fy": 27.0, "cx": 18.5, "cy": 13.0} | changes)]
 
 
-def write_frames(folder: Path) -> list[Moment]:
-    moments = make_moments(unit_m=0.001)
-    put_pictures(folder, moments, "rgb/{:04d}", "depth/{:04d}", 0.001)
+@pictures("rgb/{:04d}", "depth/{:04d}", 0.001)
+def write_frames(folder, moments):
     for i in (1, 2):
         put(folder / f"flow/{i:04d}.flo", moments[i].raw)
     put(folder / "poses.txt", [numbers(m.world_from_cam) for m in moments])
     put(folder / "timestamps.txt", [f"{0.1 * i}" for i in range(len(moments))])
     put(folder / "intrinsics.json", camera_json())
-    return moments
 
 
-def write_tum(
-    folder: Path, unit_m=1 / 5000, depth_late_s=0.012, pose_late_s=-0.004
-) -> list[Moment]:
+def write_tum(folder, unit_m=1 / 5000, depth_late_s=0.012, pose_late_s=-0.004) -> list[Moment]:
     moments = make_moments(unit_m=unit_m)
     index: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
     for i, moment in enumerate(moments):
@@ -149,23 +158,16 @@ def write_realsense(folder: Path) -> list[Moment]:
     return write_tum(folder, unit_m=0.001, depth_late_s=0.0, pose_late_s=0.0)
 
 
-OPENCV_INTRINSICS = (31.0, 27.0, 18.0, 12.5)  # K, with pixel (0, 0)'s centre at (0, 0)
-
-
-def write_sevenscenes(folder: Path) -> list[Moment]:
-    moments = make_moments(unit_m=0.001)
-    put_pictures(folder, moments, "frame-{:06d}.color", "frame-{:06d}.depth", 0.001)
+@pictures("frame-{:06d}.color", "frame-{:06d}.depth", 0.001)
+def write_sevenscenes(folder, moments):
     for i, moment in enumerate(moments):
         put(folder / f"frame-{i:06d}.pose.txt", map(numbers, moment.world_from_cam))
-    return moments
 
 
-def write_vkitti2(folder: Path) -> list[Moment]:
-    moments = make_moments(unit_m=0.01)
+@pictures("frames/rgb/Camera_0/rgb_{:05d}", "frames/depth/Camera_0/depth_{:05d}", 0.01)
+def write_vkitti2(folder, moments):
     extrinsics = ["frame cameraID r1,1 r1,2 r1,3 t1 r2,1 r2,2 r2,3 t2 r3,1 r3,2 r3,3 t3 0 0 0 1"]
     intrinsics = ["frame cameraID K[0,0] K[1,1] K[0,2] K[1,2]"]
-    camera_0 = "frames/rgb/Camera_0/rgb_{:05d}", "frames/depth/Camera_0/depth_{:05d}"
-    put_pictures(folder, moments, *camera_0, 0.01)
     for i, moment in enumerate(moments):
         if i > 0:
             flow = vkitti_flow(-moment.raw)
@@ -178,7 +180,6 @@ def write_vkitti2(folder: Path) -> list[Moment]:
             intrinsics.append(f"{i} {camera} {numbers(OPENCV_INTRINSICS)}")
     put(folder / "extrinsic.txt", extrinsics)
     put(folder / "intrinsic.txt", intrinsics)
-    return moments
 
 
 def vkitti_flow(flow: np.ndarray) -> np.ndarray:
@@ -188,20 +189,26 @@ def vkitti_flow(flow: np.ndarray) -> np.ndarray:
     return np.stack([red, green, np.full_like(red, 65535)], -1).astype(np.uint16)
 
 
-def write_sintel(folder: Path) -> list[Moment]:
+def masked(moment: Moment) -> np.ndarray:
+    """Makes the flow of a pixel unknown, and returns the mask of it."""
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[4, 5], moment.raw[:, 4, 5] = 100, np.nan
+    return mask
+
+
+def write_sintel(folder) -> list[Moment]:
     moments = make_moments(unit_m=1e-6, backwards=True)
     for i, moment in enumerate(moments):
         stem = f"cave/frame_{i + 1:04d}"
         put(folder / f"final/{stem}.png", moment.rgb)
         head = struct.pack("<fii", 202021.25, WIDTH, HEIGHT)
         put(folder / f"depth/{stem}.dpt", head + moment.depth.astype("<f4").tobytes())
-        opencv = K.copy()
-        opencv[:2, 2] -= 0.5
         cam_from_world = np.linalg.inv(moment.world_from_cam)[:3]
-        cam = struct.pack("<f", 202021.25) + opencv.tobytes() + cam_from_world.tobytes()
+        cam = struct.pack("<f", 202021.25) + OPENCV_K.tobytes() + cam_from_world.tobytes()
         put(folder / f"camdata_left/{stem}.cam", cam)
         if i + 1 < len(moments):
             put(folder / f"flow/{stem}.flo", -moment.raw)
+            put(folder / f"invalid/{stem}.png", masked(moment))
     return moments
 
 
@@ -210,7 +217,7 @@ TARTANAIR_K = np.array([[20.0, 0.0, 20.0], [0.0, 20.0, 12.0], [0.0, 0.0, 1.0]])
 NED_FROM_OPENCV = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
-def write_tartanair(folder: Path) -> list[Moment]:
+def write_tartanair(folder) -> list[Moment]:
     moments = make_moments(unit_m=1e-6, K=TARTANAIR_K, backwards=True, body=False)
     for i, moment in enumerate(moments):
         put(folder / f"image_left/{i:06d}_left.png", moment.rgb)
@@ -218,18 +225,22 @@ def write_tartanair(folder: Path) -> list[Moment]:
         if i + 1 < FRAMES:
             pair = f"{i:06d}_{i + 1:06d}"
             put(folder / f"flow/{pair}_flow.npy", -moment.raw.transpose(1, 2, 0))
-            put(folder / f"flow/{pair}_mask.npy", np.zeros((HEIGHT, WIDTH), np.uint8))
+            put(folder / f"flow/{pair}_mask.npy", masked(moment))
     poses = [moment.world_from_cam @ NED_FROM_OPENCV.T for moment in moments]
     put(folder / "pose_left.txt", map(quaternion_line, poses))
     return moments
 
 
-def write_zed(folder: Path) -> list[Moment]:
+def write_zed(folder) -> list[Moment]:
     moments = make_moments(unit_m=0.001)
     for i, moment in enumerate(moments):
         put(folder / f"left{i:06d}.png", moment.rgb)
-        suffix, depth = ("npy", moment.depth) if i % 2 else ("png", stored(moment.depth, 0.001))
-        put(folder / f"depth{i:06d}.{suffix}", depth)
+        if i % 2 == 0:
+            put(folder / f"depth{i:06d}.png", stored(moment.depth, 0.001))
+            continue
+        moment.depth[0, :3] = np.nan, np.inf, -np.inf  # beyond its range: missing
+        put(folder / f"depth{i:06d}.npy", moment.depth)
+        moment.depth[0, :3] = np.nan
     put(folder / "poses.txt", [quaternion_line(m.world_from_cam) for m in moments])
     put(folder / "intrinsics.json", camera_json())
     return moments
@@ -254,7 +265,7 @@ def write_kitti(folder: Path) -> list[Moment]:
     put(folder / "disp_occ_0/000000_10.png", disparity)
     u, v = np.rint(-raw_flow * 64) + 2**15
     put(folder / "flow_occ/000000_10.png", np.stack([u, v, u * 0 + 1], -1).astype(np.uint16))
-    projection = np.hstack([KITTI_K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], np.zeros((3, 1))])
+    projection = np.hstack([KITTI_K - (K - OPENCV_K), np.zeros((3, 1))])
     left, right = projection.copy(), projection.copy()
     left[0, 3], right[0, 3] = 31.0 * 0.06, 31.0 * (0.06 - KITTI_BASELINE_M)
     lines = ["calib_time: 09-Jan-2012 13:57:47", f"P_rect_02: {numbers(left)}"]
@@ -264,11 +275,10 @@ def write_kitti(folder: Path) -> list[Moment]:
     return [later, Moment(rgb[0], depth, pose(0), raw_flow, obj)]
 
 
-OPENCV_K = K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
 FLIPPED_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
-def write_tartanair_v2(folder: Path) -> list[Moment]:
+def write_tartanair_v2(folder) -> list[Moment]:
     moments = make_moments(unit_m=1e-6, K=TARTANAIR_K)
     for i, moment in enumerate(moments):
         put(folder / f"image_lcam_front/{i:06d}_lcam_front.png", moment.rgb)
@@ -280,26 +290,22 @@ def write_tartanair_v2(folder: Path) -> list[Moment]:
     return moments
 
 
-def write_icl_nuim(folder: Path) -> list[Moment]:
+@pictures("rgb/{}", "depth/{}", 1 / 5000, range(9, 12))
+def write_icl_nuim(folder, moments):
     # Pictures begin with 0, poses with 1. Camera and world are left-handed, with y up.
-    moments = make_moments(unit_m=1 / 5000)
-    put_pictures(folder, moments, "rgb/{}", "depth/{}", 1 / 5000, range(9, 12))
     poses = [FLIPPED_Y @ moment.world_from_cam @ FLIPPED_Y for moment in moments]
     lines = [f"{i} {quaternion_line(pose)}" for i, pose in enumerate(poses, 9)]
     put(folder / "livingRoom2.gt.freiburg", lines[1:])
     return moments[1:]
 
 
-def write_replica(folder: Path) -> list[Moment]:
-    moments = make_moments(unit_m=1 / 6553.5)
-    put_pictures(folder, moments, "results/frame{:06d}", "results/depth{:06d}", 1 / 6553.5)
+@pictures("results/frame{:06d}", "results/depth{:06d}", 1 / 6553.5)
+def write_replica(folder, moments):
     put(folder / "traj.txt", [numbers(moment.world_from_cam) for moment in moments])
-    return moments
 
 
-def write_scannet(folder: Path) -> list[Moment]:
-    moments = make_moments(unit_m=0.001)
-    put_pictures(folder, moments, "color/{}", "depth/{}", 0.001)
+@pictures("color/{}", "depth/{}", 0.001)
+def write_scannet(folder, moments):
     lost = np.full((4, 4), -np.inf)
     for i, moment in enumerate(moments):
         put(folder / f"pose/{i}.txt", map(numbers, lost if i == 2 else moment.world_from_cam))
@@ -313,7 +319,7 @@ def write_scannet(folder: Path) -> list[Moment]:
 KUBRIC_K = np.array([[30.0, 0.0, 20.0], [0.0, 30.0, 12.0], [0.0, 0.0, 1.0]])
 
 
-def write_kubric(folder: Path) -> list[Moment]:
+def write_kubric(folder) -> list[Moment]:
     moments = make_moments(unit_m=1e-6, K=KUBRIC_K)
     row, column = np.indices((HEIGHT, WIDTH)) + 0.5
     ray = np.sqrt(1 + ((column - 20) / 30) ** 2 + ((row - 12) / 30) ** 2)

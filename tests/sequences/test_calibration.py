@@ -1,13 +1,8 @@
 """Depth from one camera on the pixels of another."""
 
-from __future__ import annotations
-
+import cv2
 import numpy as np
 import pytest
-
-pytest.importorskip("cv2", reason="recordings need OpenCV")
-
-import cv2
 
 from flowrep.sequences import Registration, SequenceError
 from flowrep.sequences.calibration import camera_matrix
@@ -43,9 +38,7 @@ def test_a_wall_seen_by_a_wider_camera_has_a_border_and_no_holes():
     assert (columns[0], columns[-1]) == (8, 51)
     assert (rows[0], rows[-1]) == (10, 43)
     assert found[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].all()
-
-
-def test_a_finer_camera_has_no_holes_either():
+    # A finer camera has no holes either.
     wall = np.full((12, 16), 3.0, np.float32)
     coarse = np.array([[12.0, 0.0, 8.0], [0.0, 12.0, 6.0], [0.0, 0.0, 1.0]])
     fine = np.array([[40.0, 0.0, 27.0], [0.0, 40.0, 20.0], [0.0, 0.0, 1.0]])

@@ -1,17 +1,12 @@
 """Estimated flow of recordings, its consistency, and what is said of it."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
-
-pytest.importorskip("cv2", reason="recordings need OpenCV")
-
-import cv2
 
 from flowrep import sequences
 from flowrep.sequences.factorization import consistent
@@ -62,10 +57,8 @@ def test_after_a_repeated_picture_flow_spans_both_intervals():
     # 0.2 m a frame before a wall 4 m away; the second picture is the first again, so that in the
     # third the wall has streamed to the left since the picture was taken: by 30 * 0.4 / 4 = 3 px.
     frames = [
-        frame("a", rgb=texture(), world_from_cam=moved(0.0)),
-        frame("b", rgb=texture(), world_from_cam=moved(0.2)),
-        frame("c", rgb=np.roll(texture(), -3, axis=1), world_from_cam=moved(0.4)),
-        frame("d", rgb=np.roll(texture(), -4, axis=1), world_from_cam=moved(0.6)),
+        frame(name, rgb=np.roll(texture(), -left_px, axis=1), world_from_cam=moved(x_m))
+        for name, left_px, x_m in (("a", 0, 0.0), ("b", 0, 0.2), ("c", 3, 0.4), ("d", 4, 0.6))
     ]
     source = sequences.EstimatedFlowSource(DIS())
     first, repeated, after, then = sequences.factorize_frames(frames, source)
@@ -115,13 +108,6 @@ def test_a_change_of_focal_length_causes_no_object_flow():
     assert np.abs(made.obj).max() < 1e-5 < np.abs(raw).max() / 1000
     motion = sequences.estimated_motion(*pair, raw.astype(np.float32))
     np.testing.assert_allclose(motion.prev_from_curr, np.eye(4), atol=1e-4)
-
-
-def test_without_known_flow_the_motion_and_ego_flow_are_unknown():
-    nothing = np.full((2, 40, 60), np.nan, np.float32)
-    motion = sequences.estimated_motion(frame("a"), frame("b"), nothing)
-    assert not motion.known
-    assert not sequences.factorize_pair(frame("a"), frame("b"), nothing, motion).ego_valid.any()
 
 
 class Walk(sequences.Recording):
@@ -222,8 +208,11 @@ def test_dropped_frames_and_seconds_stand_in_the_row():
     assert score(7, sequences.factorize_pair(now, before, raw), moving_px=1.0)["gap"] == 2
 
 
-def test_unknown_numbers_are_empty_cells():
+def test_without_known_flow_all_is_unknown_and_unknown_numbers_are_empty_cells():
     nothing = np.full((2, 40, 60), np.nan, np.float32)
+    motion = sequences.estimated_motion(frame("a"), frame("b"), nothing)
+    assert not motion.known
+    assert not sequences.factorize_pair(frame("a"), frame("b"), nothing, motion).ego_valid.any()
     of_b = frame("c", raw=np.ones((2, 40, 60), np.float32), raw_since="b")  # not of a
     row = score(1, sequences.factorize_pair(frame("a"), of_b, nothing), moving_px=1.0)
     assert float(row["valid_share"]) == 0.0

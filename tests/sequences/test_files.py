@@ -1,7 +1,5 @@
 """Flow files come back as they were written; a mistake in a recording ends in one line."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os
@@ -11,18 +9,15 @@ import struct
 import zlib
 from functools import partial
 
+import cv2
 import numpy as np
 import pytest
-
-pytest.importorskip("cv2", reason="recordings need OpenCV")
-
-import cv2
 
 from flowrep import sequences
 from flowrep.sequences.factorization import pairs
 from tests.sequences import synthetic
 from tests.sequences.synthetic import camera_json, put
-from tests.sequences.test_readers import FORMATS
+from tests.sequences.test_readers import FORMATS, written
 
 
 @pytest.fixture
@@ -36,32 +31,28 @@ def test_flo_is_opencvs(flow, tmp_path):
     np.testing.assert_array_equal(cv2.readOpticalFlow(str(path)).transpose(2, 0, 1), flow)
     cv2.writeOpticalFlow(str(path), np.ascontiguousarray(2 * flow.transpose(1, 2, 0)))
     np.testing.assert_array_equal(sequences.read_flow(path), 2 * flow)
-
-
-def test_unknown_flow_is_marked_as_the_format_says_and_comes_back_as_nan(flow, tmp_path):
+    # Unknown flow is marked as the format says, and comes back as nan.
     flow[1, 2, 3] = np.nan
     valid = np.ones((5, 7), bool)
     valid[4, 0] = False
-    sequences.write_flo(tmp_path / "a.flo", flow, valid)
-    marked = cv2.readOpticalFlow(str(tmp_path / "a.flo"))
+    sequences.write_flo(path, flow, valid)
+    marked = cv2.readOpticalFlow(str(path))
     assert marked[2, 3].tolist() == marked[4, 0].tolist() == [1e10, 1e10]
-    back = sequences.read_flow(tmp_path / "a.flo")
+    back = sequences.read_flow(path)
     assert np.isnan(back).all(0).nonzero()[0].tolist() == [2, 4]
     assert np.isnan(back).sum() == 4
 
 
-def test_kitti_png_by_hand(tmp_path):
+def test_kitti_png_by_hand_and_back_within_half_a_step(flow, tmp_path):
     # u = 1.5 is 2^15 + 96, v = -2 is 2^15 - 128; the third channel says that it is known.
-    sequences.write_kitti_flow(tmp_path / "a.png", np.array([[[1.5]], [[-2.0]]], np.float32))
-    blue_green_red = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
-    assert blue_green_red[0, 0, ::-1].tolist() == [32864, 32640, 1]
-
-
-def test_kitti_png_round_trip_within_half_a_step(flow, tmp_path):
+    flow[:, 0, 0] = 1.5, -2.0
     flow[:, 1, 1] = np.nan
     flow[0, 3, 3] = 600.0  # more than the format can say
-    sequences.write_kitti_flow(tmp_path / "a.png", flow)
-    back = sequences.read_flow(tmp_path / "a.png")
+    path = tmp_path / "a.png"
+    sequences.write_kitti_flow(path, flow)
+    blue_green_red = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert blue_green_red[0, 0, ::-1].tolist() == [32864, 32640, 1]
+    back = sequences.read_flow(path)
     unknown = np.isnan(back).any(0)
     assert np.argwhere(unknown).tolist() == [[1, 1], [3, 3]]
     assert np.abs(back - flow)[:, ~unknown].max() <= 0.5 / 64
@@ -75,36 +66,39 @@ def refusal(read, name) -> str:
     return str(caught.value)
 
 
-@pytest.mark.parametrize(("suffix", "kept"), [("png", 0.99), ("jpg", 0.2)])
-def test_a_picture_that_was_cut_off_is_refused(suffix, kept, tmp_path):
-    # OpenCV decodes it, with a grey rest.
-    synthetic.write_frames(tmp_path)
-    picture = np.random.default_rng(0).integers(0, 256, (24, 40, 3), dtype=np.uint8)
-    data = cv2.imencode(f".{suffix}", picture)[1].tobytes()
-    (tmp_path / "rgb/0001.png").unlink()
-    path = tmp_path / f"rgb/0001.{suffix}"
-    path.write_bytes(data)
-    assert len(list(sequences.open_recording(tmp_path, "frames"))) == 3
-    path.write_bytes(data[: int(kept * len(data))])
-    refusal(lambda: sequences.open_recording(tmp_path, "frames"), path.name)
+@pytest.fixture
+def hang_is_a_failure():
+    def too_long(*_):
+        raise TimeoutError("it waits for the pipe")
+
+    previous = signal.signal(signal.SIGALRM, too_long)
+    signal.alarm(60)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, previous)
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")
 @pytest.mark.parametrize("name", FORMATS)
-def test_every_format_names_a_file_that_is_missing_or_empty(name, tmp_path):
-    write, open_it, *_ = FORMATS[name]
-    write(tmp_path)
+@pytest.mark.usefixtures("hang_is_a_failure")
+def test_every_format_names_a_file_that_is_missing_or_empty_and_waits_for_no_pipe(name, tmp_path):
+    _, open_it = written(name, tmp_path)
     files = [path for path in tmp_path.rglob("*") if path.is_file()]
     optional = ("timestamps.txt", "poses.txt", "groundtruth.txt", "extrinsic.txt")
     optional += ("pose_left.txt", "000000.pose.txt")
     # Where the pictures themselves are the list of frames, a missing one is a shorter recording.
-    counted = [] if name == "frames" else [frame.source for frame in open_it(tmp_path)]
+    counted = [] if name == "frames" else [frame.source for frame in open_it()]
     for path in files:
         content = path.read_bytes()
         path.write_bytes(b"")
-        refusal(lambda: open_it(tmp_path), path.name)
+        refusal(open_it, path.name)
         path.unlink()
         if path not in counted and not path.name.endswith(optional):
-            refusal(lambda: open_it(tmp_path), str(tmp_path))
+            refusal(open_it, str(tmp_path))
+        os.mkfifo(path)
+        with contextlib.suppress(sequences.SequenceError):  # what is optional is not there
+            list(open_it())
+        path.unlink()
         path.write_bytes(content)
 
 
@@ -126,12 +120,19 @@ def png_header(width, height) -> bytes:
 
 
 POSE, PICTURE = "1 0 0 0 0 1 0 0 0 0 1 0", np.zeros((24, 40, 3), np.uint8)
+NOISE = np.random.default_rng(0).integers(0, 256, (24, 40, 3), dtype=np.uint8)
+PNG, JPEG = (cv2.imencode(suffix, NOISE)[1].tobytes() for suffix in (".png", ".jpg"))
+PREVIEW = "images/scene_cam_00_final_preview/frame.0001.tonemap.jpg"
 # Format, file, what it holds, and words of the error beside the file's name.
 MISTAKES = [
     ("frames", "rgb/0001.png", PICTURE.astype(np.uint16), "16 bits"),
     ("frames", "rgb/0001.png", PICTURE[:, :-1], "[24, 39] rows and columns"),
     ("frames", "rgb/0001.png", b"GIF89a" + bytes(50), ".png"),
+    # Of these, OpenCV decodes the beginning, with a grey rest.
+    ("frames", "rgb/0001.png", PNG[: len(PNG) * 99 // 100], "cut off"),
+    ("hypersim", PREVIEW, JPEG[: len(JPEG) // 5], "cut off"),
     ("frames", "depth/0001.png", PICTURE[..., 0], "uint8"),
+    ("frames", "depth/0001.png", np.zeros((23, 40), np.uint16), "depth 40 x 23, colour 40 x 24"),
     ("frames", "depth/0001.npy", np.zeros((24, 40), np.float32), "remove one"),
     ("zed", "depth000001.npy", np.zeros((24, 40), bool), "bool"),
     ("zed", "depth000001.npy", np.zeros((24, 40, 2), np.float32), "[24, 40, 2]"),
@@ -161,6 +162,10 @@ MISTAKES = [
     ("frames", "intrinsics.json", camera_json(colour={"fx": 30.0}), "colour"),
     ("frames", "intrinsics.json", camera_json(distortions=[0.1, 0, 0, 0]), "distortions"),
     ("frames", "intrinsics.json", ["{"], "JSON"),
+    ("frames", "timestamps.txt", ["0,033", "0,066", "0,100"], "has 2 numbers in a row"),
+    ("frames", "timestamps.txt", ["0 0.0", "1 0.1", "2 0.2"], "has 2 numbers in a row"),
+    ("kubric", "metadata.json", ["[" * 200_000], "RecursionError"),
+    ("kubric", "data_ranges.json", ['{"backward_flow": {"min": 1%s}}' % ("0" * 400)], "too large"),
     ("tum", "rgb.txt", ["2.0 rgb/b.png", "1.0 rgb/a.png"], "backwards"),
     ("tum", "groundtruth.txt", ["2 0 0 0 0 0 0 1", "1 0 0 0 0 0 0 1"], "backwards"),
     ("tum", "groundtruth.txt", ["1.0 0 0 0"], "3 numbers a pose"),
@@ -175,60 +180,21 @@ MISTAKES = [
 
 @pytest.mark.parametrize(("name", "file", "content", "says"), MISTAKES)
 def test_a_mistake_ends_in_a_line_that_names_the_file(name, file, content, says, tmp_path):
-    write, open_it, *_ = FORMATS[name]
-    write(tmp_path)
+    _, open_it = written(name, tmp_path)
     put(tmp_path / file, content)
     # Where sizes differ, it is the frame's.
-    named = "0001.png" if "colour 39" in says or "flow 40" in says else file.split("/")[-1]
-    assert says in refusal(lambda: open_it(tmp_path), named)
+    named = "0001.png" if "flow 40" in says else file.split("/")[-1]
+    assert says in refusal(open_it, named)
 
 
-def test_a_file_that_is_larger_than_any_table_is_not_read(tmp_path):
+def test_a_file_that_is_larger_than_any_table_or_a_pipe_is_not_read(tmp_path):
     synthetic.write_frames(tmp_path)
     with (tmp_path / "poses.txt").open("r+b") as file:
         file.truncate(2**31)  # takes no room on disk
     assert "bytes" in refusal(lambda: sequences.open_recording(tmp_path, "frames"), "poses.txt")
-
-
-@pytest.mark.parametrize("content", ["[" * 200_000, '{"a": [1%s]}' % ("0" * 400)])
-def test_json_that_no_number_holds_ends_in_a_line(content, tmp_path):
-    synthetic.write_frames(tmp_path)
-    put(tmp_path / "k.json", [content])
-    refusal(lambda: sequences.open_recording(tmp_path, "frames", intrinsics="k.json:a"), "k.json")
-
-
-def write_video(folder):
-    synthetic.write_frames(folder)
-    put(folder / "video.mp4", b"no video")
-
-
-open_video = partial(sequences.open_recording, format="frames", rgb="video.mp4")
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")
-@pytest.mark.parametrize("name", [*FORMATS, "a video"])
-def test_a_pipe_is_refused_and_not_waited_for(name, tmp_path):
-    write, open_it, *_ = (FORMATS | {"a video": (write_video, open_video)})[name]
-    write(tmp_path)
-
-    def too_long(*_):
-        raise TimeoutError("it waits for the pipe")
-
-    previous = signal.signal(signal.SIGALRM, too_long)
-    try:
-        for path in [path for path in tmp_path.rglob("*") if path.is_file()]:
-            content = path.read_bytes()
-            path.unlink()
-            os.mkfifo(path)
-            signal.alarm(20)
-            with contextlib.suppress(sequences.SequenceError):  # what is optional is not there
-                list(open_it(tmp_path))
-            signal.alarm(0)
-            path.unlink()
-            path.write_bytes(content)
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, previous)
+    (tmp_path / "rgb.mp4").mkdir()  # no regular file, as a pipe is none
+    read = partial(sequences.open_recording, tmp_path, "frames", rgb="rgb.mp4")
+    assert "regular" in refusal(read, "rgb.mp4")
 
 
 def test_an_hdf5_file_of_two_arrays_or_none_is_refused(tmp_path):

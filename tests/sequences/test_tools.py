@@ -1,24 +1,19 @@
 """Poses and calibrations as other tools write them, by their documentation."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
-
-pytest.importorskip("cv2", reason="recordings need OpenCV")
-
-import cv2
 from scipy.spatial.transform import Rotation
 
 from flowrep.sequences import SequenceError, open_recording
 from tests.sequences import synthetic
-from tests.sequences.synthetic import HEIGHT, WIDTH, K, make_moments, numbers, put
+from tests.sequences.synthetic import HEIGHT, OPENCV_K, WIDTH, K, numbers, pictures, put
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-OPENCV_K = synthetic.OPENCV_K
+NERF = {"fl_x": 31, "fl_y": 27, "cx": 18.5, "cy": 13, "w": WIDTH, "h": HEIGHT}
 
 
 def inverse(moment):
@@ -27,6 +22,7 @@ def inverse(moment):
     return Rotation.from_matrix(pose[:3, :3]), pose[:3, 3]
 
 
+@pictures("images/{:04d}", "depth/{:04d}", 0.001)
 def write_colmap(folder, moments):
     images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "#   POINTS2D[]"]
     for i in (2, 0, 1):  # unordered
@@ -39,18 +35,15 @@ def write_colmap(folder, moments):
     put(folder / "sparse/cameras.txt", ["# CAMERA_ID, MODEL", camera])
 
 
+@pictures("images/{:04d}", "depths/{:04d}", 0.001)
 def write_nerf(folder, moments):
-    frames = [
-        {
-            "file_path": f"./images/{i:04d}.png",
-            "transform_matrix": (m.world_from_cam @ OPENGL).tolist(),
-        }
-        for i, m in enumerate(moments)
-    ][::-1]
-    camera = {"fl_x": 31, "fl_y": 27, "cx": 18.5, "cy": 13, "w": WIDTH, "h": HEIGHT, "k1": 0.0}
-    put(folder / "transforms.json", [json.dumps(camera | {"frames": frames})])
+    poses = [(moment.world_from_cam @ OPENGL).tolist() for moment in moments]
+    files = [{"file_path": f"./images/{i:04d}.png"} for i in range(len(moments))]
+    frames = [file | {"transform_matrix": pose} for file, pose in zip(files, poses)]
+    put(folder / "transforms.json", [json.dumps(NERF | {"k1": 0.0, "frames": frames[::-1]})])
 
 
+@pictures("rgb/{:06d}", "depth/{:06d}", 0.001)
 def write_bop(folder, moments):
     scene = {}
     for i, moment in enumerate(moments):
@@ -61,13 +54,17 @@ def write_bop(folder, moments):
     put(folder / "scene_camera.json", [json.dumps(scene)])
 
 
+TIMES = [f"{100 + i / 60:.3f}" for i in range(synthetic.FRAMES)]
+
+
+@pictures("lowres_wide/7_{}", "lowres_depth/7_{}", 0.001, TIMES)
 def write_arkitscenes(folder, moments):
     lines = []
-    for i, moment in enumerate(moments):
+    for time, moment in zip(TIMES, moments):
         rotation, position = inverse(moment)
-        lines.append(f"{100 + i / 60:.3f} {numbers([*rotation.as_rotvec(), *position])}")
+        lines.append(f"{time} {numbers([*rotation.as_rotvec(), *position])}")
         pincam = f"{WIDTH} {HEIGHT} 31 27 18.5 13"
-        put(folder / f"lowres_wide_intrinsics/7_{100 + i / 60:.3f}.pincam", [pincam])
+        put(folder / f"lowres_wide_intrinsics/7_{time}.pincam", [pincam])
     put(folder / "lowres_wide.traj", lines)
 
 
@@ -83,7 +80,7 @@ def write_hypersim(folder):
     """Frames 1 to 3 of a camera whose frame 0 was left out; asset units are inches."""
     row, column = np.indices((HEIGHT, WIDTH)) + 0.5
     ray = np.sqrt(1 + ((column - 18.5) / 31) ** 2 + ((row - 13) / 27) ** 2)
-    moments = make_moments(unit_m=1e-6)
+    moments = synthetic.make_moments(unit_m=1e-6)
     poses = np.stack([np.eye(4), *(moment.world_from_cam @ OPENGL for moment in moments)])
     arrays = {"_detail/cam_00/camera_keyframe_orientations": poses[:, :3, :3]}
     arrays["_detail/cam_00/camera_keyframe_positions"] = poses[:, :3, 3] / 0.0254
@@ -99,7 +96,7 @@ def write_hypersim(folder):
 
 def write_spring(folder):
     """Maps have four times the pictures' pixels, and values in pixels of the pictures."""
-    moments = make_moments(unit_m=1e-6)
+    moments = synthetic.make_moments(unit_m=1e-6)
     for i, moment in enumerate(moments, 1):
         small = moment.rgb[::2, ::2]
         moments[i - 1] = replace(moment, rgb=small.repeat(2, 0).repeat(2, 1))
@@ -115,6 +112,7 @@ def write_spring(folder):
     return moments
 
 
+@pictures("color/{:05d}", "depth/{:05d}", 0.001)
 def write_open3d(folder, moments):
     log = []
     for i, moment in enumerate(moments):
@@ -125,27 +123,8 @@ def write_open3d(folder, moments):
     put(folder / "camera_intrinsic.json", [json.dumps(camera)])
 
 
-# Format: its writer, the names of pictures and depth, what has to be given.
-TOOLS = {
-    "colmap": (write_colmap, "images/{:04d}", "depth/{:04d}", {}),
-    "nerf": (write_nerf, "images/{:04d}", "depths/{:04d}", {}),
-    "bop": (write_bop, "rgb/{:06d}", "depth/{:06d}", {"depth_unit_m": 0.001}),
-    "arkitscenes": (write_arkitscenes, "lowres_wide/7_{}", "lowres_depth/7_{}", {"scene": "7"}),
-    "open3d": (write_open3d, "color/{:05d}", "depth/{:05d}", {}),
-}
-
-
-def write(name, folder):
-    tool, rgb, depth, _ = TOOLS[name]
-    moments = make_moments(unit_m=0.001)
-    times = [f"{100 + i / 60:.3f}" for i in range(3)] if name == "arkitscenes" else None
-    synthetic.put_pictures(folder, moments, rgb, depth, 0.001, times)
-    tool(folder, moments)
-    return moments
-
-
 def test_a_picture_that_colmap_did_not_register_is_left_out(tmp_path):
-    write("colmap", tmp_path)
+    write_colmap(tmp_path)
     path = tmp_path / "sparse/images.txt"
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:4]))
     recording = open_recording(tmp_path, "colmap", pose_unit_m=2.0)
@@ -156,7 +135,7 @@ def test_a_picture_that_colmap_did_not_register_is_left_out(tmp_path):
 
 
 def test_rows_of_json_may_also_be_read_in_their_order(tmp_path):
-    write("bop", tmp_path)
+    write_bop(tmp_path)
     recording = open_recording(tmp_path, "bop", rows_by="order", depth_unit_m=0.001)
     np.testing.assert_allclose(recording[2].world_from_cam, synthetic.pose(2), atol=1e-7)
 
@@ -175,7 +154,6 @@ distortion_coefficients: {{rows: 1, cols: 5, data: {LENS}}}
 TAG = " !!opencv-matrix"
 OPENCV = "%YAML:1.0\n---" + ROS.replace("_matrix:", f"_matrix:{TAG}").replace("s: {", f"s:{TAG} {{")
 COLMAP = f"1 OPENCV {WIDTH} {HEIGHT} 31 27 18.5 13 {numbers(LENS[:4])}"
-NERF = {"fl_x": 31, "fl_y": 27, "cx": 18.5, "cy": 13, "w": WIDTH, "h": HEIGHT}
 NERF_FISHEYE = {"camera_model": "OPENCV_FISHEYE", **dict(zip(("k1", "k2", "k3", "k4"), LENS))}
 NGP_FISHEYE = {"is_fisheye": True, **dict(zip(("k1", "k2", "k3", "k4"), LENS))}
 # Half of 40 x 24 pixels over 31 and 27; without the second angle, fy would be 31.

@@ -76,6 +76,8 @@ def test_the_nearer_triangle_hides_the_farther_one_in_any_order():
         depth, semantic, _ = see(*bodies)
         np.testing.assert_array_equal(depth[2], [2.0] * 4 + [4.0] * 5)
         np.testing.assert_array_equal(semantic[2], [4] * 4 + [3] * 5)
+    # What is not shown hides nothing.
+    np.testing.assert_array_equal(see(near, far, is_shown=[False, True])[0], 4.0)
 
 
 def test_triangles_are_invisible_from_behind():
@@ -113,12 +115,6 @@ def test_bodies_move_with_their_poses_and_the_camera_with_its_own():
         assert np.argwhere(instance == 7).tolist() == seen_at
     assert depth[2, 3] == 4.0
     assert depth[2, 4] == 9.0
-
-
-def test_a_body_that_is_not_shown_hides_nothing():
-    near, far = facing(2.0, -9, 9, -9, 9, BALL), facing(4.0, -9, 9, -9, 9)
-    np.testing.assert_array_equal(see(near, far, is_shown=[False, True])[0], 4.0)
-    np.testing.assert_array_equal(see(near, far, is_shown=[True, True])[0], 2.0)
 
 
 def test_neighbouring_triangles_leave_no_gap():
