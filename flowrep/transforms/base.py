@@ -306,7 +306,8 @@ class RecurrentTransform(MapTransform):
 
     In a replay buffer, stored outputs are left as they are. Outputs that are missing under `"next"`
     are computed from the root. Outputs that are missing at the root need a trajectory: a dimension
-    named "time", and `("next", "done")`. Its first frame counts as an episode's first.
+    named "time", and `("next", "done")`. Its first frame counts as an episode's first. Steps out of
+    their order are refused, if the batch holds their next frames.
     """
 
     @property
@@ -379,15 +380,7 @@ class RecurrentTransform(MapTransform):
             return tensordict
         # A stored output is right even if the next frame is several steps ahead.
         if missing := [key for key in self.out_keys if following.get(key, None) is None]:
-            # TorchRL's MultiStep and MultiStepTransform write the number of steps to this key.
-            steps = tensordict.get("steps_to_next_obs", None)
-            if steps is not None and bool((steps != 1).any()):
-                lost = ("next", missing[0])
-                raise MissingKey(
-                    f"{lost} is not in the batch, and can't be computed: its next frames lie up to "
-                    f"{int(steps.max())} steps ahead ('steps_to_next_obs'). Store {lost} as the "
-                    "env gave it, before MultiStepTransform moves it"
-                )
+            _check_one_step(tensordict, ("next", missing[0]))
             later = self.advance(self._carried(tensordict), self._tensors(following))
             for key, value in zip(self.out_keys, later):
                 if key in missing:
@@ -416,9 +409,11 @@ class RecurrentTransform(MapTransform):
                 f"{missing!r}, or give a trajectory with ('next', 'done') and a dimension named "
                 f"'time' (td.refine_names(..., 'time')); names are {tensordict.names}"
             )
+        _check_one_step(tensordict, missing)  # n steps also say "done" n steps early
+        time, is_end = tensordict.names.index("time"), flags_of_batch(done, tensordict)
+        self._check_steps_follow(tensordict["next"], now, is_end, time)
         # Step by step, as the env does it: equal to the last bit, whatever a subclass computes.
-        time = tensordict.names.index("time")
-        ended = flags_of_batch(done, tensordict).unbind(time)
+        ended = is_end.unbind(time)
         steps: list[tuple[Tensor, ...]] = []
         before: list[Tensor] = []
         for t, frame in enumerate(zip(*(value.unbind(time) for value in now))):
@@ -429,6 +424,28 @@ class RecurrentTransform(MapTransform):
             before = [step[key] for key in self.carried_keys]
             steps.append(outputs)
         return {key: torch.stack(each, time) for key, each in zip(self.out_keys, zip(*steps))}
+
+    def _check_steps_follow(
+        self, following: TensorDictBase, now: Sequence[Tensor], is_end: Tensor, time: int
+    ) -> None:
+        """Raises ValueError if the next frame of a step isn't that of the step behind it."""
+        count = is_end.shape[time] - 1
+        for key, frames in zip(self.in_keys, now):
+            after = following.get(key, None)
+            if after is None or not has_values(frames):
+                continue
+            # Close, not equal, because buffers may hold next frames as differences.
+            behind, after = frames.narrow(time, 1, count), after.narrow(time, 0, count)
+            follows = torch.isclose(behind, after.to(behind.dtype), equal_nan=True)
+            is_padding = (behind == 0).flatten(is_end.ndim).all(-1)  # of split_trajectories
+            follows = follows.flatten(is_end.ndim).all(-1) | is_padding
+            if not bool((follows | is_end.narrow(time, 0, count)).all()):
+                raise ValueError(
+                    f"{key!r} under 'next' is not that of the step behind, though no episode ends "
+                    "there: steps that were shuffled, left out or joined are no trajectory, even "
+                    f"if their dimension is named 'time'. Compute {self.label} before, or set "
+                    "('next', 'done') where a rollout ends"
+                )
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         """Returns the input specs of `step`, including the `carried_keys`."""
@@ -481,6 +498,18 @@ class RecurrentTransform(MapTransform):
                     f"{type(self).__name__}, an earlier transform, writes is that of its last "
                     "step, not of an episode's first frame: put it first"
                 )
+
+
+def _check_one_step(tensordict: TensorDictBase, lost: NestedKey) -> None:
+    """Raises MissingKey for what can't be computed of a batch of n-step returns."""
+    # TorchRL's MultiStep and MultiStepTransform write the number of steps to this key.
+    steps = tensordict.get("steps_to_next_obs", None)
+    if steps is not None and bool((steps != 1).any()):
+        raise MissingKey(
+            f"{lost!r} is not in the batch, and can't be computed: its next frames lie up to "
+            f"{int(steps.max())} steps ahead ('steps_to_next_obs'). Store {lost!r} as "
+            "the env gave it, before MultiStepTransform moves it"
+        )
 
 
 def as_keys(keys: Keys) -> list[NestedKey]:

@@ -41,7 +41,8 @@ class FrameStack(RecurrentTransform):
     A batch without a stored stack has to be a trajectory, with a dimension named "time" and
     `("next", "done")`. Its first frame counts as an episode's first. A buffer may thus store single
     frames (two per transition, or one if `next` is looked up) and sample slices of an episode.
-    Stacks are exact from the k-th step of a slice on, `batch[:, k - 1:]`.
+    Stacks are exact from the k-th step of a slice on, `batch[:, k - 1:]`. Shuffled or joined steps,
+    whose dimension TorchRL still names "time", are refused if their next frames are there.
 
     Args:
         k: the number of frames.

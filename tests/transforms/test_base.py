@@ -10,6 +10,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch._dynamo.testing import CompileCounter
+from torchrl.collectors import Collector
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase, SerialEnv, TransformedEnv, check_env_specs
 from torchrl.envs.transforms import (
@@ -264,3 +265,39 @@ def test_envs_that_reset_themselves_give_the_same_first_frames():
     for flow in ("ego", "raw"):  # of an episode's first frame, and of no other, is 0
         still = (own[flow] == 0).flatten(2).all(-1)
         assert still.nonzero().tolist() == [[0, 0], [0, 3], [0, 6], [1, 0], [1, 4], [1, 8]]
+
+
+def rollouts_of(env: int) -> TensorDict:
+    """Returns a rollout that ends before its episode does."""
+    return FakeSensorEnv((), env).rollout(2)
+
+
+NO_TRAJECTORIES = {
+    "joined": lambda: torch.cat([rollouts_of(0), rollouts_of(1)]),
+    "shuffled": lambda: FakeSensorEnv().rollout(3)[torch.tensor([1, 0, 2])],
+    "every second": lambda: FakeSensorEnv((), 1).rollout(4)[::2],
+}
+
+
+@pytest.mark.parametrize("make", NO_TRAJECTORIES.values(), ids=list(NO_TRAJECTORIES))
+@pytest.mark.parametrize(
+    "transform", [T.CameraMotion(), T.FrameStack(in_keys=("sensor", "rgb"), out_keys="rgb2")]
+)
+def test_steps_out_of_order_are_no_trajectory_although_torchrl_still_names_their_time(
+    make, transform
+):
+    td = make().exclude(("sensor", "prev_from_curr"), ("next", "sensor", "prev_from_curr"))
+    assert td.names == ["time"]
+    with pytest.raises(ValueError, match="no episode ends there"):
+        transform(td)
+
+
+def test_trajectories_may_be_padded_by_split_trajectories():
+    env = TransformedEnv(FakeSensorEnv((2,)), T.CameraMotion(out_keys="motion"))
+    (online,) = Collector(env, frames_per_batch=10, total_frames=10, split_trajs=True)
+    mask = online["collector", "mask"]
+    assert not mask.all()
+    offline = T.CameraMotion(out_keys="motion")(
+        online.exclude("motion", ("next", "motion")).refine_names(None, "time")
+    )
+    assert same_bits(offline["motion"][mask], online["motion"][mask])

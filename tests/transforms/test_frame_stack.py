@@ -88,6 +88,11 @@ def test_n_step_returns_keep_the_stack_that_was_stored():
 def test_n_step_returns_without_stored_stacks_are_refused():
     with pytest.raises(KeyError, match=r"up to 3 steps ahead.*Store \('next', 'depth3'\)"):
         n_step_sample(3, ("next", STACK))
+    _, online = n_step_sample(3)
+    trajectory = online.exclude(STACK, "next").update(online.select(("next", "done")))
+    trajectory["steps_to_next_obs"] = torch.full((12, 1), 3)
+    with pytest.raises(KeyError, match=r"'depth3' is not in the batch.*up to 3 steps ahead"):
+        stack_of_three()(trajectory)
     sample, online = n_step_sample(1, ("next", STACK))  # the step after, as ever
     want = online["next", STACK][sample["index"]]
     assert same_bits(sample["next", STACK], want)
