@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.utils import expand_as_right
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, RoundRobinWriter, Storage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import Sampler
@@ -20,6 +21,7 @@ from torchrl.envs import Transform
 from flowrep.agent.map_codec import MapCodec, store_maps
 
 OUTCOME = ("reward", "done", "terminated")
+TRAJECTORIES = ("collector", "traj_ids")  # written by TorchRL's collectors
 
 
 class ReplayMemory(TensorDictReplayBuffer):
@@ -71,10 +73,14 @@ class PackSteps(Transform):
     | `action`, `is_init` | unchanged |
     | `("next", name)` of `reward`, `done`, `terminated` | `name` |
     | | `env`: index of the env, from 0 to N - 1 |
+
+    By a TorchRL collector's trajectories, a batch of other envs, as from the next worker of a
+    `MultiAsyncCollector`, doesn't continue the last one, and a flattened batch is refused.
     """
 
     def __init__(self, codecs: Sequence[MapCodec]) -> None:
         self.codecs = tuple(codecs)
+        self._latest: Tensor | None = None  # the trajectory of each env's last step
         super().__init__(in_keys=[codec.key for codec in codecs])
 
     def _inv_call(self, steps: TensorDictBase) -> TensorDictBase:
@@ -82,14 +88,30 @@ class PackSteps(Transform):
             raise KeyError(
                 "steps lack 'is_init', a mark of restarts: append TorchRL's InitTracker to the env"
             )
-        outcome = [("next", name) for name in OUTCOME]
-        steps = time_first(steps.select(*self.in_keys, "action", "is_init", *outcome))
+        keys = [*self.in_keys, "action", "is_init", *[("next", name) for name in OUTCOME]]
+        keys += [TRAJECTORIES] if TRAJECTORIES in steps.keys(True) else []
+        steps = time_first(steps.select(*keys))
+        if TRAJECTORIES in keys:
+            steps["is_init"] = self._with_marks(steps["is_init"], steps[TRAJECTORIES])
         times, envs = steps.batch_size
         steps = steps.reshape(-1)
         rows = store_maps(self.codecs, steps).update(steps["next"])
         rows["action"], rows["is_init"] = steps["action"], steps["is_init"]
         rows["env"] = torch.arange(envs, dtype=torch.int32, device=rows.device).repeat(times)
         return rows
+
+    def _with_marks(self, is_init: Tensor, trajectories: Tensor) -> Tensor:
+        """Returns `is_init` `[T, N, 1]`, True also where a trajectory isn't the last batch's."""
+        first, before, self._latest = trajectories[0], self._latest, trajectories[-1].clone()
+        if (count := len(first.unique())) < len(first):
+            raise ValueError(
+                f"{len(first)} steps side by side are of {count} trajectories: extend by a "
+                "collector's batch as it is, without reshape(-1) or flatten_tensordicts"
+            )
+        if before is None or before.shape != first.shape:
+            return is_init
+        other = expand_as_right(first != before, is_init[0])
+        return torch.cat([(is_init[0] | other).unsqueeze(0), is_init[1:]])
 
     def forward(self, transitions: TensorDictBase) -> TensorDictBase:
         """Returns a sample unchanged."""

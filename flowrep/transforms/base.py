@@ -306,8 +306,7 @@ class RecurrentTransform(MapTransform):
 
     In a replay buffer, stored outputs are left as they are. Outputs that are missing under `"next"`
     are computed from the root. Outputs that are missing at the root need a trajectory: a dimension
-    named "time", and `("next", "done")`. Its first frame counts as an episode's first. Steps out of
-    their order are refused, if the batch holds their next frames.
+    named "time", and `("next", "done")`. Its first frame counts as an episode's first.
     """
 
     @property
@@ -501,8 +500,7 @@ class RecurrentTransform(MapTransform):
 
 
 def _check_one_step(tensordict: TensorDictBase, lost: NestedKey) -> None:
-    """Raises MissingKey for what can't be computed of a batch of n-step returns."""
-    # TorchRL's MultiStep and MultiStepTransform write the number of steps to this key.
+    """Raises MissingKey for a batch of n-step returns, as TorchRL's MultiStep marks them."""
     steps = tensordict.get("steps_to_next_obs", None)
     if steps is not None and bool((steps != 1).any()):
         raise MissingKey(

@@ -142,6 +142,31 @@ def test_steps_may_come_one_by_one_or_in_a_batch_with_its_time_last_or_named():
     assert stored(trajectory) == transitions(single) == expected
 
 
+def collected(numbers, trajectories):
+    """Steps `[N, T]` of a TorchRL collector; each frame's number follows that of the one before."""
+    seen = torch.tensor(numbers)
+    steps = [step(column.tolist(), (column + 1).tolist()) for column in seen.unbind(1)]
+    data = torch.stack(steps, 1)
+    data["collector", "traj_ids"] = torch.tensor(trajectories)[:, None].expand(data.shape).clone()
+    return data.refine_names(None, "time")
+
+
+def test_batches_of_several_workers_of_a_collector_are_not_joined():
+    replay = memory()
+    replay.extend(collected([[10, 11], [20, 21]], [0, 1]))
+    replay.extend(collected([[12, 13], [22, 23]], [0, 1]))
+    replay.extend(collected([[50, 51], [60, 61]], [2, 3]))  # as MultiAsyncCollector yields them
+    pairs = {(seen, following) for seen, _, _, _, following, _ in transitions(replay)}
+    assert pairs == {(n, n + 1) for n in (10, 11, 12, 20, 21, 22, 50, 60)}
+
+
+def test_a_collector_s_batch_that_was_flattened_is_refused():
+    with pytest.raises(ValueError, match=r"6 steps.*2 trajectories.*reshape\(-1\)"):
+        memory().extend(collected([[10, 11, 12], [20, 21, 22]], [0, 1]).reshape(-1))
+    one_each = collected([[10], [20]], [0, 1])  # which is what a flat batch means
+    memory().extend(one_each.reshape(-1))
+
+
 def test_a_full_memory_overwrites_its_oldest_rows():
     replay = memory(capacity=7)  # not a multiple of the two environments
     for i in range(9):
