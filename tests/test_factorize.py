@@ -61,7 +61,7 @@ def test_a_job_writes_flow_pictures_masks_tables_and_a_video(moments, tmp_path):
     assert code == 0
     kinds = ("raw", "ego", "obj")
     flows = [f"flow/{k}/{n}{s}" for k in kinds for n in ("0001", "0002") for s in (".flo", ".png")]
-    others = ["flow/0001.npz", "flow/0002.npz", *(f"pictures/{k}/0002.png" for k in kinds)]
+    others = ["flow/0001.npz", "flow/0002.npz", *(f"pictures/{k}/0001.png" for k in kinds)]
     others += ["moving/0001.png", "moving/0002.png"]
     tables = ["frames.csv", "job.json", "strip.mp4", "summary.json", "trajectory.txt"]
     written = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file()}

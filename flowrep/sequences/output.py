@@ -70,7 +70,7 @@ class Output:
 
     def append(self, index: int, result: FactorizedFrame) -> None:
         """Writes a frame's files, then its row."""
-        self._write_flow(index, result)
+        self._write_flow(result)
         if self.masks:
             code = np.where(moves(result, self.moving_px), 255, 0)
             mask = np.where(result.valid, code, 127).astype(np.uint8)
@@ -103,15 +103,17 @@ class Output:
             medians[name] = float(np.median(values)) if values else None
         return medians
 
-    def _write_flow(self, index: int, result: FactorizedFrame) -> None:
+    def _write_flow(self, result: FactorizedFrame) -> None:
         name = result.frame.name
+        # Not by the frame's index: the first has no flow, and a stride may skip all the others.
+        has_pictures = self.pictures_every and len(self.rows) % self.pictures_every == 0
         for kind in FLOW_NAMES:
             flow = shown(kind, result)
             if "flo" in self.flow_files:
                 write_flo(self._file(f"flow/{kind}/{name}.flo"), flow)
             if "kitti" in self.flow_files:
                 write_kitti_flow(self._file(f"flow/{kind}/{name}.png"), flow)
-            if self.pictures_every and index % self.pictures_every == 0:
+            if has_pictures:
                 picture = viz.representation_strip({kind: flow}, flow_scale_px=self.scale_px)
                 write_picture(self._file(f"pictures/{kind}/{name}.png"), picture)
         if "npz" in self.flow_files:
