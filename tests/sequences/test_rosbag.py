@@ -184,6 +184,21 @@ def test_a_circle_of_tf_frames_is_followed_once(tmp_path):
         open_recording(path, "rosbag")
 
 
+def test_a_frame_with_two_parents_is_refused(tmp_path):
+    # Odometry publishes the base in odom, SLAM in map. Transforms of both would be interpolated.
+    moments, bag = make_moments(unit_m=0.001), Bag("ros1", tmp_path)
+    with bag.writer:
+        bag.info("/camera/color/camera_info", "base")
+        for i, moment in enumerate(moments):
+            bag.image(RGB, stamp(i), "base", "rgb8", moment.rgb)
+            bag.image(DEPTH, stamp(i), "base", "32FC1", moment.depth)
+            for late_ns, parent in ((-20_000_000, "map"), (10_000_000, "odom")):
+                bag.transform("/tf", stamp(i) + late_ns, parent, "base", moment.world_from_cam)
+    with pytest.raises(SequenceError, match="base in map and in odom"):
+        open_recording(bag.path, "rosbag")
+    assert not open_recording(bag.path, "rosbag", world="base").has_poses
+
+
 @pytest.mark.parametrize("kind", KINDS[:2])
 def test_a_missing_static_transform_is_reported_and_can_be_given(kind, tmp_path):
     path, moments = write(kind, tmp_path, static=False)
