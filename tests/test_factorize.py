@@ -233,6 +233,20 @@ def test_a_camera_whose_skipped_frame_begins_a_clip_gives_no_pair_across_it(tmp_
     assert pairs == [("0", "2"), ("4", "6")]
 
 
+def test_clips_of_another_size_are_factorised_too(tmp_path):
+    synthetic.write_kitti(tmp_path / "in")
+    for path in [*(tmp_path / "in").rglob("000000*")]:
+        other = path.with_name(path.name.replace("000000", "000001"))
+        if path.suffix == ".png":
+            assert cv2.imwrite(str(other), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[:-2])
+        else:
+            shutil.copy(path, other)
+    code, out = factorize(tmp_path, "flow=exact", format="kitti")
+    assert code == 0
+    assert [row["name"] for row in table(out)] == ["000000_10", "000001_10"]
+    assert read_flow(out / "flow/obj/000001_10.flo").shape == (2, 22, 40)
+
+
 def test_exact_flow_of_a_recording_without_flow_is_refused(tmp_path):
     synthetic.write_sintel(tmp_path / "in")
     given = ["format.scene=cave", "flow=exact", "video=false"]

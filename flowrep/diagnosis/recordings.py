@@ -68,8 +68,13 @@ class Examination:
     def diagnosis(self) -> Diagnosis:
         """Returns the diagnosis of all pairs so far."""
         posed = [pairs.has_poses for pairs, _ in self._seen]
-        is_lost = [any(posed) and not each for each in posed]
-        reasons = ["a pose is unknown" if x else why for x, why in zip(is_lost, self._reasons)]
+        sizes = [pairs.now.shape for pairs, _ in self._seen]  # KITTI has pictures of several
+        usual = max(sizes, key=sizes.count, default=None)
+        reasons = [
+            "a pose is unknown" if any(posed) and not is_posed
+            else "pictures have another size" if size != usual else why
+            for is_posed, size, why in zip(posed, sizes, self._reasons)
+        ]  # fmt: skip
         used = tested(reasons)
         if not used:
             return no_diagnosis(reasons)
