@@ -240,14 +240,16 @@ def decoded(path: Path, data: bytes) -> NDArray[Any]:
 
 
 def _read_exr(path: Path) -> NDArray[Any]:
-    """Returns the first of the channels Z, R, Y and V; renderers put a layer's name before it."""
+    """Returns a channel: of those of depth if one's name says so, the first of Z, R, Y and V."""
     require("reading .exr", "exr", "OpenEXR")
     import OpenEXR
 
     window = OpenEXR.File(str(regular(path)), header_only=True).header()["dataWindow"]
     check_size(path, *(int(last) - int(first) + 1 for first, last in zip(*window)))
     planes = OpenEXR.File(str(regular(path)), separate_channels=True).channels()
-    name = min(planes, key=lambda name: (f"ZRYV{name[-1]}".index(name[-1]), name))
+    # Renderers put a layer's name before it: Blender's files may hold Image.R and Depth.V.
+    order = {x: ("depth" not in x.lower(), f"ZRYV{x[-1]}".index(x[-1]), x) for x in planes}
+    name = min(planes, key=order.__getitem__)
     pixels: NDArray[Any] = planes[name].pixels
     return pixels
 

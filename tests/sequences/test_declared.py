@@ -49,8 +49,9 @@ def test_of_an_exr_file_the_depth_is_read(moments, tmp_path):
     (tmp_path / "depth/0001.png").unlink()
     path = tmp_path / "depth/0001.exr"
     planes = dict.fromkeys(("View.Combined.A", "View.Combined.R"), 0 * moments[1].depth)
-    OpenEXR.File({}, planes | {"View.Depth.Z": moments[1].depth}).write(str(path))
-    np.testing.assert_array_equal(open_frames(tmp_path)[1].depth, moments[1].depth)
+    for name in ("View.Depth.Z", "View.Depth.V", "depth"):
+        OpenEXR.File({}, planes | {name: moments[1].depth}).write(str(path))
+        np.testing.assert_array_equal(open_frames(tmp_path)[1].depth, moments[1].depth)
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(SequenceError, match=r"0001\.exr"):
         open_frames(tmp_path)[1]
