@@ -277,8 +277,9 @@ class Rig:
         if self.distortion:
             columns, rows = self._once(self._stored_pixels, K, size)
             rgb = None if rgb is None else cv2.remap(rgb, columns, rows, cv2.INTER_LINEAR)
-            if not is_registered:
-                depth = cv2.remap(depth, columns, rows, cv2.INTER_NEAREST, borderValue=[np.nan])
+            stored = np.zeros(size, np.float32) if is_registered else depth
+            seen = cv2.remap(stored, columns, rows, cv2.INTER_NEAREST, borderValue=[np.nan])
+            depth = depth + seen if is_registered else seen
         return rgb, depth
 
     def _stored_pixels(self, K: Matrix, size: tuple[int, int]) -> Any:

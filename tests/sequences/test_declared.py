@@ -275,6 +275,10 @@ def test_a_lens_is_taken_out_of_pictures_and_depth(lens, place, tmp_path):
     outside = (u < -1) | (u > 120) | (v < -1) | (v > 90)
     assert outside.any() == (lens == "opencv")
     assert np.isnan(frame.depth[outside]).all()
+    # Depth of a camera of its own has no lens, but there it would meet the picture's black.
+    registered = open_frames(tmp_path, **options, depth_intrinsics=[95.0, 90.0, 62.5, 44.0])[1]
+    assert np.isnan(registered.depth[outside]).all()
+    np.testing.assert_array_equal(registered.depth[inside], 1.0 + column[inside])
 
 
 def test_a_ray_s_length_is_that_of_the_pixel_without_the_lens(tmp_path):
