@@ -167,7 +167,7 @@ class DeclaredRecording(Recording):
                 self._rgbs = [*listed.values()]
         self._names, found = [*listed], [*depths.values()]
         if self.depth_by == "time" and self._times_s is not None and depth_times_s is not None:
-            rows = matching.match_depth(depth_times_s, self._times_s, self.tolerance_s)
+            (rows, _), _ = match_times(depth_times_s, self._times_s, self.tolerance_s)
             self._depths = [found[row] for row in rows]
             return {f"without depth within {self.tolerance_s} s": rows < 0}
         by_order = self.depth_by == "order"
@@ -271,6 +271,9 @@ class DeclaredRecording(Recording):
                 says = f"has two rows with the same {by}, or one that is nan or inf"
                 raise SequenceError(path, f"{says}; select rows with format.rows_where")
             rows = np.array([row_of.get(key_of(name), -1) for name in self._names])
+            if len(found := rows[rows >= 0]) > len({*found}):
+                says = f"has one row for frames whose {by} is the same, such as {self._names[0]}"
+                raise SequenceError(path, f"{says}: give format.rgb, in which * is the {by} alone")
         return np.stack([rows, rows]), np.zeros(len(rows))
 
     def _read_times(self) -> LeftOut:
@@ -308,6 +311,7 @@ class DeclaredRecording(Recording):
                 poses @= np.linalg.inv(self._rig.colour_from_depth)  # they are the depth camera's
             self._poses = matching.poses_between(poses, late, share)
         near = f" within {self.tolerance_s} s" if self.rows_by == "time" else ""
+        near = f" of its own{near}" if near and not self.interpolate else near
         is_lost = ~lacking & lost[late].any(0)
         return {f"without a pose{near}": lacking, f"lost (nan, inf, 0) in {path.name}": is_lost}
 

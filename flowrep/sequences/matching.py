@@ -20,8 +20,9 @@ def match_times(
 ) -> tuple[Indices, Floats]:
     """Returns the rows around each wanted time, `[2, frames]`, and the share of the way between.
 
-    Without `interpolate` both rows are the nearest. They are -1 if they are farther away than
-    the format's `tolerance_s`, or if rows on both sides are needed and there are none.
+    Without `interpolate` both rows are the nearest, which belongs to the nearest of the times that
+    share it. They are -1 if they are too far away, another time's, or needed on both sides of a
+    time that has none on one.
     """
     after = np.searchsorted(times_s, wanted_s).clip(0, len(times_s) - 1)
     before = np.where(times_s[after] <= wanted_s, after, after - 1).clip(0)
@@ -32,18 +33,10 @@ def match_times(
         near = is_between & (gaps_s.max(0) <= tolerance_s)
         return np.where(near, rows, -1), gaps_s[0] / np.maximum(gaps_s.sum(0), 1e-9)
     nearest = np.where(gaps_s[0] <= gaps_s[1], before, after)
-    near = gaps_s.min(0) <= tolerance_s
+    nearest_first = np.argsort(gaps_s.min(0), kind="stable")
+    _, owners = np.unique(nearest[nearest_first], return_index=True)
+    near = (gaps_s.min(0) <= tolerance_s) & np.isin(range(len(nearest)), nearest_first[owners])
     return np.where(near, [nearest, nearest], -1), np.zeros(len(nearest))
-
-
-def match_depth(depth_times_s: Floats, times_s: Floats, tolerance_s: float) -> Indices:
-    """Returns the depth map nearest to each picture, -1 if it is too far, or another picture's.
-
-    Two pictures may have the same nearest depth map; it belongs to the nearer picture.
-    """
-    (rows, _), _ = match_times(depth_times_s, times_s, tolerance_s)
-    (pictures, _), _ = match_times(times_s, depth_times_s, tolerance_s)
-    return np.where(pictures[rows] == np.arange(len(rows)), rows, -1)
 
 
 def poses_between(poses: Floats, rows: Indices, share: Floats) -> Floats:

@@ -114,7 +114,7 @@ class RosBag(Recording):
         """Matches depth and transforms to pictures, and says how well they fit."""
         start = min(stamps[0], depth_stamps[0])
         times_s, depth_times_s = ((np.array(x) - start) * 1e-9 for x in (stamps, depth_stamps))
-        rows = matching.match_depth(depth_times_s, times_s, self.tolerance_s)
+        (rows, _), _ = matching.match_times(depth_times_s, times_s, self.tolerance_s)
         said = [f"pictures are {self._rgb}, depth {self._depth}"]
         if (rows >= 0).any():
             lag_s = np.median((depth_times_s[rows] - times_s)[rows >= 0])

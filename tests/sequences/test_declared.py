@@ -373,6 +373,18 @@ def test_a_table_has_one_row_for_a_frame_s_number(key, moments, tmp_path):
         open_frames(tmp_path, **keyed)
 
 
+def test_a_row_is_not_that_of_several_frames(moments, tmp_path):
+    put(tmp_path / "poses.txt", [f"{i} {numbers(m.world_from_cam)}" for i, m in enumerate(moments)])
+    for kind in ("rgb", "depth"):
+        for name in FRAMES:
+            (tmp_path / f"{kind}/{name}.png").rename(tmp_path / f"{kind}/{name}_cam1.png")
+    keyed = {"rows_by": "number", "times": None, "flow": None}
+    with pytest.raises(SequenceError, match=r"poses\.txt.*0000_cam1.*format\.rgb"):
+        open_frames(tmp_path, **keyed)
+    recording = open_frames(tmp_path, **keyed, rgb="rgb/*_cam1", depth="depth/*_cam1")
+    np.testing.assert_array_equal(recording[2].world_from_cam, moments[2].world_from_cam)
+
+
 def test_pictures_are_shrunk_to_the_size_of_depth_with_their_camera(moments, tmp_path):
     for i, moment in enumerate(moments):
         put(tmp_path / f"rgb/{i:04d}.png", moment.rgb.repeat(3, 0).repeat(2, 1))

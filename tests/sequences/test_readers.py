@@ -158,6 +158,17 @@ def test_each_picture_has_the_nearest_depth_and_pose_within_the_tolerance(tmp_pa
     assert matches(open_recording(tmp_path, "tum")) == [(1, 1.0, 2.0)]
 
 
+def test_a_pose_belongs_to_one_picture_alone(tmp_path):
+    # With the first one's pose, the second picture would have no ego flow, and the third too much.
+    times, poses = [1.0, 1.012, 1.03], [(1.001, at(1)), (1.03, at(3))]
+    write_times(tmp_path, times, times, poses)
+    recording = open_recording(tmp_path, "tum")
+    assert matches(recording) == [(0, 1.0, 1.0), (2, 3.0, 3.0)]
+    assert recording.notes[0].endswith("1.012")
+    between = open_recording(tmp_path, "tum", interpolate=True)
+    assert matches(between) == [(1, 2.0, round(1 + 2 * 11 / 29, 9)), (2, 3.0, 3.0)]
+
+
 def test_a_pose_at_the_pictures_own_time_lies_between_its_neighbours(tmp_path):
     # A quarter of the way from x = 1 to x = 3, and of a right angle about y.
     turned = "3 0 0 0 0.7071067811865476 0 0.7071067811865476"
