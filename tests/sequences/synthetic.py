@@ -138,17 +138,18 @@ def write_frames(folder, moments):
     put(folder / "intrinsics.json", camera_json())
 
 
-def write_tum(folder, unit_m=1 / 5000, depth_late_s=0.012, pose_late_s=-0.004) -> list[Moment]:
+def write_tum(folder, unit_m=1 / 5000, depth_late_s=0.012, pose_late_s=0.004) -> list[Moment]:
     moments = make_moments(unit_m=unit_m)
     index: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
     for i, moment in enumerate(moments):
         rgb_s = 100 + 0.1 * i
-        depth_s, pose_s = rgb_s + depth_late_s, rgb_s + pose_late_s
+        depth_s = rgb_s + depth_late_s
         put(folder / f"rgb/{rgb_s:.6f}.png", moment.rgb)
         put(folder / f"depth/{depth_s:.6f}.png", stored(moment.depth, unit_m))
         index["rgb"].append(f"{rgb_s:.6f} rgb/{rgb_s:.6f}.png")
         index["depth"].append(f"{depth_s:.6f} depth/{depth_s:.6f}.png")
-        index["groundtruth"].append(f"{pose_s:.6f} {quaternion_line(moment.world_from_cam)}")
+        for pose_s in (rgb_s - pose_late_s, rgb_s + pose_late_s):
+            index["groundtruth"].append(f"{pose_s:.6f} {quaternion_line(moment.world_from_cam)}")
     for name, lines in index.items():
         put(folder / f"{name}.txt", ["# a comment", *lines])
     return moments

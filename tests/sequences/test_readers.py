@@ -146,7 +146,7 @@ def matches(recording):
 def test_each_picture_has_the_nearest_depth_and_pose_within_the_tolerance(tmp_path):
     poses = [(0.995, at(1)), (1.1, at(2)), (1.198, at(3)), (1.203, at(4))]
     write_times(tmp_path, [1.0, 1.1, 1.2], [1.01, 1.13, 1.19, 1.215], poses)
-    recording = open_recording(tmp_path, "tum", tolerance_s=0.02)
+    recording = open_recording(tmp_path, "tum", interpolate=False)
     # 1.1 has no depth within 0.02 s (1.13); of 1.19 and 1.215 the first is nearer to 1.2.
     assert matches(recording) == [(0, 1.0, 1.0), (2, 3.0, 3.0)]
     assert [frame.timestamp_s for frame in recording] == [1.0, 1.2]
@@ -162,10 +162,10 @@ def test_a_pose_belongs_to_one_picture_alone(tmp_path):
     # With the first one's pose, the second picture would have no ego flow, and the third too much.
     times, poses = [1.0, 1.012, 1.03], [(1.001, at(1)), (1.03, at(3))]
     write_times(tmp_path, times, times, poses)
-    recording = open_recording(tmp_path, "tum")
+    recording = open_recording(tmp_path, "tum", interpolate=False)
     assert matches(recording) == [(0, 1.0, 1.0), (2, 3.0, 3.0)]
     assert recording.notes[0].endswith("1.012")
-    between = open_recording(tmp_path, "tum", interpolate=True)
+    between = open_recording(tmp_path, "tum")
     assert matches(between) == [(1, 2.0, round(1 + 2 * 11 / 29, 9)), (2, 3.0, 3.0)]
 
 
@@ -173,16 +173,17 @@ def test_a_pose_at_the_pictures_own_time_lies_between_its_neighbours(tmp_path):
     # A quarter of the way from x = 1 to x = 3, and of a right angle about y.
     turned = "3 0 0 0 0.7071067811865476 0 0.7071067811865476"
     write_times(tmp_path, [1.0025], [1.0], [(1.0, at(1)), (1.01, turned)])
-    (frame,) = open_recording(tmp_path, "tum", interpolate=True)
+    (frame,) = open_recording(tmp_path, "tum")
     np.testing.assert_allclose(frame.world_from_cam[:3, 3], [1.5, 0, 0], atol=1e-9)
     expected = cv2.Rodrigues(np.array([0.0, np.pi / 8, 0.0]))[0]
     np.testing.assert_allclose(frame.world_from_cam[:3, :3], expected, atol=1e-9)
-    assert matches(open_recording(tmp_path, "tum")) == [(0, 1.0, 1.0)]  # the nearest
+    nearest = open_recording(tmp_path, "tum", interpolate=False)
+    assert matches(nearest) == [(0, 1.0, 1.0)]
 
 
 def test_poses_are_not_interpolated_across_a_gap_nor_beyond_the_ends(tmp_path):
     poses = [(1.0, at(1)), (1.5, at(2)), (1.51, at(3))]
     times = [0.99, 1.0, 1.2, 1.505]  # the second is a pose's own
     write_times(tmp_path, times, times, poses)
-    recording = open_recording(tmp_path, "tum", interpolate=True)
+    recording = open_recording(tmp_path, "tum")
     assert matches(recording) == [(1, 2.0, 1.0), (3, 4.0, 2.5)]
