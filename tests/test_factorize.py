@@ -374,6 +374,10 @@ def test_a_still_camera_needs_neither_poses_nor_depth(tmp_path):
     assert (arrays["ego"] == 0).all()
     inside_px = np.median(arrays["obj"][:, 40:60, 32:54], axis=(1, 2))
     np.testing.assert_allclose(inside_px, [2.0, 0.0], atol=0.3)
+    shutil.rmtree(out)
+    factorize(tmp_path, *still, "stride=2", source="in.mp4", format="video")
+    assert table(out)[0]["gap"] == "1"
+    assert np.loadtxt(out / "trajectory.txt")[:, 0].tolist() == [0, 2]
 
 
 @needs_7scenes

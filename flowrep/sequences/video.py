@@ -46,7 +46,8 @@ class StillVideo:
             # A still camera has no ego flow, whatever depth and K are.
             K = camera_matrix([1.0], (height, width), first_pixel_centre=0.5)
             depth = np.full((height, width), np.inf, dtype=np.float32)
-            yield Frame(f"{number:06d}", self.source, np.eye(4), K, depth, rgb)
+            name = f"{number:06d}"
+            yield Frame(name, self.source, np.eye(4), K, depth, rgb, position=number)
 
 
 def pictures(source: int | str) -> Iterator[NDArray[np.uint8]]:
