@@ -233,8 +233,8 @@ class RosBag(Recording):
             frame = parents[0]
         if root is not None and frame != root:
             there = {parent for edge in self._edges.values() for parent in edge.parents}
-            there = ", ".join(sorted(there)) or "nothing"
-            raise SequenceError(self.path, f"tf doesn't lead to {root}, but to {there}")
+            listing = ", ".join(sorted(there)) or "nothing"
+            raise SequenceError(self.path, f"tf doesn't lead to {root}, but to {listing}")
         return edges
 
     def _poses(
