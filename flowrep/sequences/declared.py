@@ -310,8 +310,8 @@ class DeclaredRecording(Recording):
             if self._rig.colour_from_depth is not None:
                 poses @= np.linalg.inv(self._rig.colour_from_depth)  # they are the depth camera's
             self._poses = matching.poses_between(poses, late, share)
-        near = f" within {self.tolerance_s} s" if self.rows_by == "time" else ""
-        near = f" of its own{near}" if near and not self.interpolate else near
+        which = "on both sides" if self.interpolate else "of its own"
+        near = f" {which} within {self.tolerance_s} s" if self.rows_by == "time" else ""
         is_lost = ~lacking & lost[late].any(0)
         return {f"without a pose{near}": lacking, f"lost (nan, inf, 0) in {path.name}": is_lost}
 

@@ -12,6 +12,7 @@ from flowrep.sequences.recording import SequenceError
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
+_ROUNDED_S = 0.0005  # times are often rounded to milliseconds
 LeftOut = dict[str, NDArray[np.bool_]]  # frames by why they are left out
 
 
@@ -21,18 +22,18 @@ def match_times(
     """Returns the rows around each wanted time, `[2, frames]`, and the share of the way between.
 
     Without `interpolate` both rows are the nearest, which belongs to the nearest of the times that
-    share it. They are -1 if they are too far away, another time's, or needed on both sides of a
-    time that has none on one.
+    share it. With it, a row at the wanted time, up to rounding, is enough. They are -1 if they are
+    too far away, another time's, or needed on both sides of a time that has none on one.
     """
     after = np.searchsorted(times_s, wanted_s).clip(0, len(times_s) - 1)
     before = np.where(times_s[after] <= wanted_s, after, after - 1).clip(0)
     rows = np.stack([before, after])
     gaps_s = np.abs(times_s[rows] - wanted_s)
-    if interpolate:
-        is_between = (before != after) | (gaps_s[0] == 0)
-        near = is_between & (gaps_s.max(0) <= tolerance_s)
-        return np.where(near, rows, -1), gaps_s[0] / np.maximum(gaps_s.sum(0), 1e-9)
     nearest = np.where(gaps_s[0] <= gaps_s[1], before, after)
+    if interpolate:
+        near = (before != after) & (gaps_s.max(0) <= tolerance_s)
+        own = np.where(gaps_s.min(0) <= _ROUNDED_S, nearest, -1)
+        return np.where(near, rows, own), gaps_s[0] / np.maximum(gaps_s.sum(0), 1e-9)
     nearest_first = np.argsort(gaps_s.min(0), kind="stable")
     _, owners = np.unique(nearest[nearest_first], return_index=True)
     near = (gaps_s.min(0) <= tolerance_s) & np.isin(range(len(nearest)), nearest_first[owners])

@@ -181,6 +181,13 @@ def test_a_pose_at_the_pictures_own_time_lies_between_its_neighbours(tmp_path):
     assert matches(nearest) == [(0, 1.0, 1.0)]
 
 
+def test_poses_as_rare_as_pictures_are_theirs_up_to_a_rounded_time(tmp_path):
+    # 30 a second; the last one is 0.7 ms off, too much for a rounded time.
+    poses, times = [(1.0, at(1)), (1.0334, at(2)), (1.0667, at(3))], [1.0003, 1.033, 1.066]
+    write_times(tmp_path, times, times, poses)
+    assert matches(open_recording(tmp_path, "tum")) == [(0, 1.0, 1.0), (1, 2.0, 2.0)]
+
+
 def test_poses_are_not_interpolated_across_a_gap_nor_beyond_the_ends(tmp_path):
     poses = [(1.0, at(1)), (1.5, at(2)), (1.51, at(3))]
     times = [0.99, 1.0, 1.2, 1.505]  # the second is a pose's own
