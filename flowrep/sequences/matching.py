@@ -12,8 +12,8 @@ from flowrep.sequences.recording import SequenceError
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
-_ROUNDED_S = 0.0005  # times are often rounded to milliseconds
 LeftOut = dict[str, NDArray[np.bool_]]  # frames by why they are left out
+_ROUNDED_S = 0.0005  # times are often rounded to milliseconds
 
 
 def match_times(
@@ -23,7 +23,7 @@ def match_times(
 
     Without `interpolate` both rows are the nearest, which belongs to the nearest of the times that
     share it. With it, a row at the wanted time, up to rounding, is enough. They are -1 if they are
-    too far away, another time's, or needed on both sides of a time that has none on one.
+    farther away than a format's `tolerance_s`, another time's, or missing on one of two sides.
     """
     after = np.searchsorted(times_s, wanted_s).clip(0, len(times_s) - 1)
     before = np.where(times_s[after] <= wanted_s, after, after - 1).clip(0)
