@@ -443,7 +443,7 @@ class RecurrentTransform(MapTransform):
                     f"{key!r} under 'next' is not that of the step behind, though no episode ends "
                     "there: steps that were shuffled, left out or joined are no trajectory, even "
                     f"if their dimension is named 'time'. Compute {self.label} before, or set "
-                    "('next', 'done') where a rollout ends"
+                    "('next', 'done') where a rollout ends; SensorNoise needs a frame_key here"
                 )
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:

@@ -80,7 +80,7 @@ def test_a_robots_hand_in_maniskill():
 def share_that_warps(frames, K):
     """The share of visible pixels of runs `[N, T]` that flow leads to their surface a frame before.
 
-    By points, body by body, and the nearest pixel. What is nearer hides it.
+    By points, body by body, and the nearest pixel; every seventh pixel. What is nearer hides it.
     """
     agreed, visible, inverse = 0, 0, torch.as_tensor(K, dtype=torch.float32).inverse()
     for run, t in np.ndindex(len(frames), frames.shape[1] - 1):
@@ -89,6 +89,7 @@ def share_that_warps(frames, K):
         v, u = (x + 0.5 for x in torch.meshgrid(*map(torch.arange, body.shape), indexing="ij"))
         x, y = (torch.stack([u, v]) - frames[run, t + 1]["raw"]).floor().long()
         inside = (x >= 0) & (x < body.shape[1]) & (y >= 0) & (y < body.shape[0]) & ~depth.isinf()
+        inside &= torch.arange(body.numel()).reshape(body.shape) % 7 == 0
         x, y = x.where(inside, 0), y.where(inside, 0)
         points = depth[..., None] * (torch.stack([u, v, u**0], -1) @ inverse.T)
         motion = now["instance_motion"][body]
