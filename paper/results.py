@@ -1,7 +1,7 @@
 """The page of results: `make results` writes paper/results.md and its figures.
 
 claims.py tests what claims.yaml declares, results.md.jinja has the words around the numbers, and
-all numbers come from the packed runs. tests/test_readme.py compares the README's table with them.
+all numbers come from the packed runs. tests/test_docs.py compares the README's table with them.
 """
 
 import csv

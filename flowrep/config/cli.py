@@ -267,9 +267,8 @@ def as_typed(arguments: Sequence[str], schema: type[Command]) -> list[str]:
         if is_argument and "run" in schema.model_fields and names_run:
             folders.append(override("run", text).removeprefix("run="))
         else:
-            if is_folder := _is_folder(key, value):
-                value = os.path.expanduser(value)  # which shells don't do after `hydra.run.dir=`
-            others.append(override(key, value) if is_folder else text)
+            home = os.path.expanduser(value)  # a shell keeps the ~ in `hydra.run.dir=~/x`
+            others.append(override(key, home) if _is_folder(key, value) else text)
         previous = text
     if folders and any(text.startswith("run=") for text in others):
         raise UsageError(f"{folders[0]} and run= both name folders: leave out run=")

@@ -277,6 +277,7 @@ class Rig:
         if self.distortion:
             columns, rows = self._once(self._stored_pixels, K, size)
             rgb = None if rgb is None else cv2.remap(rgb, columns, rows, cv2.INTER_LINEAR)
+            # Registered depth has no lens; it is missing where the picture is.
             stored = np.zeros(size, np.float32) if is_registered else depth
             seen = cv2.remap(stored, columns, rows, cv2.INTER_NEAREST, borderValue=[np.nan])
             depth = depth + seen if is_registered else seen

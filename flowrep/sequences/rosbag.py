@@ -31,7 +31,7 @@ _COLOUR = {
 class _Edge(NamedTuple):
     """A frame's poses in its parent, at some times, or at any if it is static."""
 
-    parents: list[str]
+    parents: set[str]  # of which a tree has one
     is_static: bool
     stamps: list[int]
     poses: list[Pose]
@@ -216,8 +216,8 @@ class RosBag(Recording):
                 t, q = each.transform.translation, each.transform.rotation
                 numbers = np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w])
                 parent, child = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
-                edge = edges.setdefault(child, _Edge([], topic.endswith("static"), [], []))
-                edge.parents.append(parent)
+                edge = edges.setdefault(child, _Edge(set(), topic.endswith("static"), [], []))
+                edge.parents.add(parent)
                 edge.stamps.append(_ns(each.header.stamp))
                 edge.poses.append(as_pose(numbers, topic, layout="xyz_xyzw"))
         return edges
@@ -227,14 +227,15 @@ class RosBag(Recording):
         edges: list[_Edge] = []
         while frame != root and frame in self._edges and len(edges) <= len(self._edges):
             edges.append(self._edges[frame])
-            if len(parents := sorted({*edges[-1].parents})) > 1:
+            parents = sorted(edges[-1].parents)
+            if len(parents) > 1:
                 says = f"tf has {frame} in {' and in '.join(parents)}, so its poses are mixed"
                 raise SequenceError(self.path, f"{says}: cut one out of the bag")
             frame = parents[0]
         if root is not None and frame != root:
-            there = {parent for edge in self._edges.values() for parent in edge.parents}
-            listing = ", ".join(sorted(there)) or "nothing"
-            raise SequenceError(self.path, f"tf doesn't lead to {root}, but to {listing}")
+            found = set[str]().union(*(edge.parents for edge in self._edges.values()))
+            there = ", ".join(sorted(found)) or "nothing"
+            raise SequenceError(self.path, f"tf doesn't lead to {root}, but to {there}")
         return edges
 
     def _poses(
@@ -260,7 +261,7 @@ class RosBag(Recording):
         for frame in (colour, depth):
             pose = np.eye(4)
             for edge in takewhile(lambda edge: edge.is_static, self._edges_above(frame, None)):
-                pose, frame = edge.poses[-1] @ pose, edge.parents[0]
+                pose, frame = edge.poses[-1] @ pose, min(edge.parents)
             ends.append(pose)
             bases.add(frame)
         if len(bases) > 1:
